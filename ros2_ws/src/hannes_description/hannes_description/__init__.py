@@ -1,0 +1,1 @@
+"""What the Hannes hand is: parameters with provenance, joints, signals, geometry. Imports no other Hannes package."""
