@@ -7,10 +7,11 @@ hypothesis fitted to the thesis' figures (65536 counts a turn of a magnet behind
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi, radians
 from types import MappingProxyType
-from typing import Final, Mapping
+from typing import Final
 
 FINGERS: Final[tuple[str, ...]] = ("index", "middle", "ring", "little")
 """The four long fingers, radial to ulnar; each has the joints abd, mcp and pip."""

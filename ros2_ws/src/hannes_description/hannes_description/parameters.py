@@ -1,0 +1,176 @@
+"""Parameters with provenance: value, unit, bounds, status and source of every number."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from .errors import HannesError
+
+STATUSES = ("datasheet", "published", "measured", "identified", "assumed")
+_KEYS = ("value", "unit", "lower", "upper", "status", "source", "fixed")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of a model.
+
+    value, lower, upper  in `unit`; lower <= value <= upper
+    status               one of STATUSES
+    source               where the number comes from
+    fixed                applied, never optimised
+    """
+
+    value: float
+    unit: str
+    lower: float
+    upper: float
+    status: str
+    source: str
+    fixed: bool = False
+
+    def __post_init__(self) -> None:
+        for key in ("value", "lower", "upper"):
+            if not math.isfinite(getattr(self, key)):
+                raise HannesError(f"{key} is {getattr(self, key)}; it must be a finite number.")
+        if not self.lower <= self.value <= self.upper:
+            raise HannesError(f"value {self.value} {self.unit} is outside its bounds [{self.lower}, {self.upper}].")
+        if self.status not in STATUSES:
+            raise HannesError(f"status {self.status!r} is unknown; valid are {', '.join(STATUSES)}.")
+
+    def at(self, value: float, *, status: str | None = None, source: str | None = None) -> Parameter:
+        """The same parameter with another value; the bounds are widened where they would exclude it."""
+        return replace(self, value=float(value), lower=min(self.lower, float(value)),
+                       upper=max(self.upper, float(value)), status=status or self.status,
+                       source=source or self.source)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain types, for YAML and JSON; `fixed` only where it is set."""
+        out: dict[str, Any] = {"value": self.value, "unit": self.unit, "lower": self.lower, "upper": self.upper,
+                               "status": self.status, "source": self.source}
+        return out | {"fixed": True} if self.fixed else out
+
+    @classmethod
+    def from_dict(cls, name: str, entry: object, where: str) -> Parameter:
+        """Read one entry of a YAML file; errors name the parameter and the file."""
+        if not isinstance(entry, Mapping):
+            raise HannesError(f"{where}: parameter '{name}' must be a mapping with the keys {', '.join(_KEYS)}.")
+        unknown = sorted(set(entry) - set(_KEYS), key=str)
+        missing = [key for key in _KEYS[:6] if key not in entry]
+        if unknown or missing:
+            raise HannesError(f"{where}: parameter '{name}': "
+                              + (f"unknown keys {unknown}; " if unknown else "")
+                              + (f"missing keys {missing}; " if missing else "")
+                              + f"valid keys are {', '.join(_KEYS)}.")
+        try:
+            return cls(float(entry["value"]), str(entry["unit"]), float(entry["lower"]), float(entry["upper"]),
+                       str(entry["status"]), str(entry["source"]), bool(entry.get("fixed", False)))
+        except (TypeError, ValueError) as error:
+            raise HannesError(f"{where}: parameter '{name}': {error}") from error
+
+
+@dataclass(frozen=True)
+class ParameterSet(Mapping[str, Parameter]):
+    """Parameters by dotted name, such as `motor.resistance`; immutable."""
+
+    entries: Mapping[str, Parameter]
+    source: str = "memory"
+    _hash: list[str] = field(default_factory=list, repr=False, compare=False)
+
+    def __getitem__(self, name: str) -> Parameter:
+        try:
+            return self.entries[name]
+        except KeyError:
+            group = name.split(".")[0]
+            near = [n for n in self.entries if n.split(".")[0] == group] or sorted(
+                {n.split(".")[0] + ".*" for n in self.entries})
+            raise HannesError(f"Unknown parameter '{name}' in {self.source}; valid are {', '.join(near)}.") from None
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.entries
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.entries)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def value(self, name: str) -> float:
+        """The value of one parameter in its unit."""
+        return self[name].value
+
+    def values_of(self, group: str) -> dict[str, float]:
+        """All values of a group, by the name after the dot: `values_of("motor")["resistance"]`."""
+        out = {n.split(".", 1)[1]: p.value for n, p in self.entries.items() if n.split(".", 1)[0] == group}
+        if not out:
+            raise HannesError(f"No parameter group '{group}' in {self.source}.")
+        return out
+
+    def with_values(self, values: Mapping[str, float], *, status: str | None = None,
+                    source: str | None = None) -> ParameterSet:
+        """A new set in which the named parameters have other values."""
+        changed = {name: self[name].at(value, status=status, source=source) for name, value in values.items()}
+        return ParameterSet({**self.entries, **changed}, self.source)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {name: parameter.to_dict() for name, parameter in self.entries.items()}
+
+    @property
+    def sha256(self) -> str:
+        """Hash of names and values."""
+        if not self._hash:
+            text = json.dumps({n: [p.value, p.unit] for n, p in self.entries.items()}, sort_keys=True)
+            self._hash.append(hashlib.sha256(text.encode()).hexdigest())
+        return self._hash[0]
+
+    @classmethod
+    def from_dict(cls, content: object, where: str) -> ParameterSet:
+        """Nested groups or dotted names: `motor: {resistance: {value: ...}}`."""
+        if not isinstance(content, Mapping):
+            raise HannesError(f"{where}: expected a mapping of parameters.")
+        entries: dict[str, Parameter] = {}
+        for group, members in content.items():
+            if isinstance(members, Mapping) and "value" in members:
+                entries[str(group)] = Parameter.from_dict(str(group), members, where)
+            elif isinstance(members, Mapping):
+                for name, entry in members.items():
+                    entries[f"{group}.{name}"] = Parameter.from_dict(f"{group}.{name}", entry, where)
+            else:
+                raise HannesError(f"{where}: '{group}' must be a group of parameters or a parameter.")
+        return cls(entries, where)
+
+
+def read_yaml(path: Path, what: str) -> Any:
+    """Read YAML safely; one clear error for a missing, unreadable or broken file."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise HannesError(f"Cannot read {what} '{path}': {error}.") from error
+    try:
+        return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise HannesError(f"{what} '{path}' is not valid YAML: {str(error).splitlines()[0]}.") from error
+
+
+def data_path(*parts: str) -> Path:
+    """Path of a data file that the package ships."""
+    return Path(str(resources.files("hannes_description").joinpath("data", *parts)))
+
+
+def load_parameters(name_or_path: str | Path) -> ParameterSet:
+    """Load a shipped set by name (`hannes`) or any file by path."""
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        path = data_path("parameters", f"{name_or_path}.yaml")
+        if not path.exists():
+            names = sorted(p.stem for p in data_path("parameters").glob("*.yaml"))
+            raise HannesError(f"No parameter set '{name_or_path}'; shipped are {', '.join(names)}, or give a .yaml path.")
+    return ParameterSet.from_dict(read_yaml(path, "parameter file"), str(path))
