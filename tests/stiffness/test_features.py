@@ -1,0 +1,144 @@
+"""Features: the streaming code and the array code are the same, also over gaps, restarts, rates and bad
+values."""
+
+import numpy as np
+import pytest
+from hannes_description.errors import HannesError
+from hannes_stiffness.features import FeatureSpec, FeatureStream, extract, hold
+
+
+def closure(rate: float, duration: float = 8.0, seed: int = 0, jitter: float = 0.0):
+    """Half-sine references of 4 s, a lagging encoder and a noisy signed current."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, duration, 1.0 / rate)
+    t = t + rng.uniform(-jitter, jitter, len(t)) / rate
+    reference = np.maximum(0.0, 14.57 * np.sin(2 * np.pi * 0.25 * t))
+    encoder = np.maximum(0.0, 13.0 * np.sin(2 * np.pi * 0.25 * (t - 0.05)))
+    current = 0.4 * np.cos(2 * np.pi * 0.25 * t) + 0.05 * rng.standard_normal(len(t))
+    return t, current, reference, encoder
+
+
+def stream(arrays, spec=None):
+    feed = FeatureStream(spec or FeatureSpec())
+    samples = [s for s in (feed.push(*map(float, row)) for row in zip(*arrays, strict=True)) if s is not None]
+    return feed, samples
+
+
+def assert_same(arrays, spec=None):
+    feed, samples = stream(arrays, spec)
+    batch = extract(*arrays, spec)
+    assert len(samples) == len(batch.time)
+    np.testing.assert_array_equal([s.time for s in samples], batch.time)
+    np.testing.assert_array_equal(
+        np.array([s.values for s in samples], np.float32).reshape(-1, 3), batch.values
+    )
+    np.testing.assert_array_equal(np.array([s.void for s in samples], bool), batch.void)
+    assert (feed.rejected, feed.restarts) == (batch.rejected, batch.restarts)
+    return batch
+
+
+@pytest.mark.parametrize("rate", [5.0, 20.0, 29.0, 30.0, 31.0, 50.0, 100.0, 300.0, 1000.0])
+@pytest.mark.parametrize("jitter", [0.0, 0.1, 0.45])
+@pytest.mark.parametrize("current", ["rectified", "signed"])
+def test_stream_equals_arrays_at_every_rate(rate, jitter, current):
+    batch = assert_same(closure(rate, jitter=jitter), FeatureSpec(current=current))
+    assert len(batch.time) <= 8.0 * min(rate, 30.0) + 2
+
+
+def test_stream_equals_arrays_over_gaps_restarts_and_bad_values():
+    t, i, r, q = closure(100.0)
+    rng = np.random.default_rng(3)
+    t = t.copy()
+    t[300:] += 1.0  # a hole
+    t[500:] -= 3.0  # a bag played again
+    t[600:] = t[600:] - 0.05  # a little out of order: dropped until it is past
+    for values, bad in ((i, np.nan), (r, np.inf), (q, 1e9), (t, np.nan), (i, -1e300)):
+        values[rng.integers(0, len(t), 5)] = bad
+    batch = assert_same((t, i, r, q))
+    assert batch.restarts == 2
+    assert batch.rejected >= 20
+    assert np.isfinite(batch.values).all()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_stream_equals_arrays_on_random_clocks(seed):
+    rng = np.random.default_rng(seed)
+    n = 400
+    t = np.cumsum(
+        rng.choice(
+            [0.001, 0.01, 0.033, 0.0, -0.02, 0.2, 0.3, -0.5],
+            n,
+            p=[0.4, 0.2, 0.2, 0.05, 0.05, 0.05, 0.03, 0.02],
+        )
+    )
+    assert_same((t, rng.normal(0, 1, n), np.cumsum(rng.normal(0, 0.1, n)), np.cumsum(rng.normal(0, 0.1, n))))
+
+
+def test_samples_come_at_the_trained_rate_and_average_the_current():
+    t = np.arange(3000) / 1000.0
+    ripple = 0.5 + 0.3 * (-1.0) ** np.arange(3000)
+    batch = extract(t, ripple, np.zeros(3000), np.zeros(3000))
+    assert abs(len(batch.time) - 90) <= 1
+    np.testing.assert_allclose(batch.values[1:, 0], 0.5, atol=0.02)
+
+
+def test_thirty_hertz_passes_unchanged():
+    t, i, r, q = closure(30.0, jitter=0.04)
+    batch = extract(t, i, r, q)
+    np.testing.assert_array_equal(batch.values, np.column_stack([np.abs(i), r, q]).astype(np.float32))
+
+
+def test_below_the_void_current_is_void():
+    t = np.arange(100) / 30.0
+    batch = extract(t, np.linspace(0.25, 0.35, 100), np.zeros(100), np.zeros(100))
+    np.testing.assert_array_equal(batch.void, np.linspace(0.25, 0.35, 100) < 0.3)
+
+
+def test_the_start_of_each_closure_is_void_and_nothing_else():
+    t = np.arange(240) / 30.0
+    reference = np.maximum(0.0, 14.57 * np.sin(2 * np.pi * 0.25 * t))
+    batch = extract(t, np.full(240, 1.0), reference, reference)
+    starts = np.flatnonzero(np.diff(batch.void.astype(int)) == 1) + 1
+    np.testing.assert_allclose(t[starts], [1 / 30, 4 + 1 / 30], atol=1e-9)
+    assert batch.void.sum() == 2 * 6
+
+
+def test_rectified_and_signed_current():
+    t = np.arange(90) / 30.0
+    arrays = (t, np.full(90, -0.5), np.zeros(90), np.zeros(90))
+    assert (extract(*arrays, FeatureSpec()).values[:, 0] == 0.5).all()
+    signed = extract(*arrays, FeatureSpec(current="signed"))
+    assert (signed.values[:, 0] == -0.5).all()
+    assert not signed.void.any()
+
+
+def test_hold_never_looks_ahead_and_forgets_old_values():
+    out = hold([1.0, 1.1, 1.2], [10.0, 11.0, 12.0], [0.99, 1.0, 1.15, 1.2, 1.44, 2.0])
+    np.testing.assert_array_equal(out, [np.nan, 10.0, 11.0, 12.0, 12.0, np.nan])
+    assert np.isnan(hold([], [], [1.0])).all()
+
+
+@pytest.mark.parametrize(
+    "change, word",
+    [
+        ({"current": "squared"}, "rectified"),
+        ({"version": "other/9"}, "version"),
+        ({"rate": 0.0}, "rate"),
+        ({"rate": float("nan")}, "rate"),
+        ({"mask": "long"}, "mask"),
+        ({"void_current": True}, "void_current"),
+    ],
+)
+def test_a_wrong_setting_is_named(change, word):
+    with pytest.raises(HannesError, match=word):
+        FeatureSpec(**change)
+
+
+def test_arrays_of_different_length_are_refused():
+    with pytest.raises(HannesError, match="one length"):
+        extract([0.0, 1.0], [0.0], [0.0, 0.0], [0.0, 0.0])
+
+
+def test_nothing_in_nothing_out():
+    assert len(extract([], [], [], []).time) == 0
+    assert extract([np.nan], [0.0], [0.0], [0.0]).rejected == 1
