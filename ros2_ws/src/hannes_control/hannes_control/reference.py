@@ -1,0 +1,65 @@
+"""Reference profiles of the encoder position: what the hand is asked to do, in rad at the motor pulley."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hannes_description.errors import HannesError
+from hannes_description.joints import RAD_PER_COUNT
+
+FULL_CLOSURE = 40000 * RAD_PER_COUNT
+"""rad; amplitude of the thesis' bench test (P17: 40000 counts)."""
+
+Profile = NDArray[np.float64]
+
+
+def _check(**values: float) -> None:
+    for name, value in values.items():
+        if not math.isfinite(value) or value <= 0.0:
+            raise HannesError(f"Reference profile: {name} is {value}; it must be a positive number.")
+
+
+def half_sine(closures: int = 1, amplitude: float = FULL_CLOSURE, period: float = 4.0, dt: float = 1e-3) -> Profile:
+    """max(0, amplitude sin(2 pi t / period)), `closures` periods sampled at dt: thesis P17 as read in X01."""
+    _check(closures=closures, amplitude=amplitude, period=period, dt=dt)
+    t = np.arange(round(closures * period / dt)) * dt
+    return np.maximum(0.0, amplitude * np.sin(2.0 * math.pi * t / period))
+
+
+def ramp_hold(closures: int = 1, amplitude: float = FULL_CLOSURE, rise: float = 1.0, hold: float = 0.5,
+              fall: float = 1.0, rest: float = 0.5, dt: float = 1e-3) -> Profile:
+    """Rise, hold, fall and rest, `closures` times; rise and fall are raised cosines (continuous velocity)."""
+    _check(closures=closures, amplitude=amplitude, rise=rise, hold=hold, fall=fall, rest=rest, dt=dt)
+    up = 0.5 - 0.5 * np.cos(math.pi * np.arange(round(rise / dt)) * dt / rise)
+    down = 0.5 + 0.5 * np.cos(math.pi * np.arange(round(fall / dt)) * dt / fall)
+    one = np.concatenate([up, np.ones(round(hold / dt)), down, np.zeros(round(rest / dt))])
+    return amplitude * np.tile(one, closures)
+
+
+def reversals(closures: int = 1, amplitude: float = FULL_CLOSURE, period: float = 6.0, ripple: float = 0.15,
+              ripple_period: float = 0.6, dt: float = 1e-3) -> Profile:
+    """A half sine with small reversals on top: shows slack, backlash, presliding and inertia."""
+    _check(closures=closures, amplitude=amplitude, period=period, ripple=ripple, ripple_period=ripple_period, dt=dt)
+    slow = half_sine(closures, 1.0, period, dt)
+    t = np.arange(slow.size) * dt
+    wave = ripple * np.sin(2.0 * math.pi * t / ripple_period) * np.minimum(1.0, 4.0 * slow) * (slow > 0.0)
+    return amplitude * np.clip(slow * (1.0 - ripple) + wave, 0.0, 1.0)
+
+
+PROFILES: Mapping[str, Callable[..., Profile]] = {"half_sine": half_sine, "ramp_hold": ramp_hold,
+                                                  "reversals": reversals}
+"""Profiles by name, for nodes and the command line."""
+
+
+def make_profile(name: str, **options: float) -> Profile:
+    """A profile by name; unknown names and options are refused with the valid ones."""
+    if name not in PROFILES:
+        raise HannesError(f"Unknown reference profile '{name}'; valid are {', '.join(PROFILES)}.")
+    try:
+        return PROFILES[name](**options)
+    except TypeError as error:
+        raise HannesError(f"Reference profile '{name}': {error}.") from error

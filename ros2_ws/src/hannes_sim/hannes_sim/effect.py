@@ -1,0 +1,278 @@
+"""A physical effect: one class in one file, found by name or by `path.py:Class`."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import pkgutil
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar
+
+import numpy as np
+from numba import cfunc
+from numpy.typing import NDArray
+
+from hannes_description.errors import HannesError
+from hannes_description.model import EffectEntry
+from hannes_description.parameters import Parameter
+
+from .native import EFFECT_SIGNATURE
+from .ports import N_INPUTS, N_OUTPUTS
+
+ENTRY_POINTS = "hannes.effects"
+"""Entry-point group in which another package offers its effects."""
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """One parameter of an effect.
+
+    unit           SI
+    lower, upper   bounds of the search; what physics allows
+    typical        a value that a hand may show; sets the scale of the search
+    vanishing      the value at which the effect contributes exactly nothing, or None for a shape parameter
+    starts         values from which a search starts, for a parameter in which the error has several minima
+    description    what it is
+    """
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    typical: float
+    vanishing: float | None = None
+    description: str = ""
+    starts: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.lower <= self.typical <= self.upper:
+            raise HannesError(f"Effect parameter '{self.name}': typical {self.typical} is outside "
+                              f"[{self.lower}, {self.upper}].")
+        if self.vanishing is not None and not self.lower <= self.vanishing <= self.upper:
+            raise HannesError(f"Effect parameter '{self.name}': vanishing {self.vanishing} is outside "
+                              f"[{self.lower}, {self.upper}].")
+        outside = [value for value in self.starts if not self.lower <= value <= self.upper]
+        if outside:
+            raise HannesError(f"Effect parameter '{self.name}': starts {outside} are outside "
+                              f"[{self.lower}, {self.upper}].")
+
+
+class Effect:
+    """Base of all effects; subclasses are declarations and never instantiated.
+
+    name        identifier in model files and on the command line
+    title       what people read
+    parameters  the effect's parameters; at least one has a vanishing value
+    states      number of own states (float64, zero at reset)
+    memory      True where the effect remembers earlier closures (temperature, say), so that every closure of a
+                recording has to be simulated in turn
+    looks_like  one sentence: what it looks like in the data
+    told_by     one sentence: the experiment that shows it best
+
+    `contribute(x, p, s, y)` reads the inputs x and the parameters p, may advance its own states s by one step
+    x[DT], and ADDS to the outputs y (indices in ports.py).  It is compiled by numba as a C function: plain
+    arithmetic, `math` functions and constants only.
+    """
+
+    name: ClassVar[str] = ""
+    title: ClassVar[str] = ""
+    parameters: ClassVar[tuple[EffectParameter, ...]] = ()
+    states: ClassVar[int] = 0
+    memory: ClassVar[bool] = False
+    looks_like: ClassVar[str] = ""
+    told_by: ClassVar[str] = ""
+
+    @staticmethod
+    def contribute(x: Any, p: Any, s: Any, y: Any) -> None:
+        raise NotImplementedError
+
+    @classmethod
+    def strength(cls) -> EffectParameter:
+        """The first parameter that has a vanishing value: at that value the effect is off."""
+        return next(p for p in cls.parameters if p.vanishing is not None)
+
+    @classmethod
+    def entry(cls, values: Mapping[str, float] | None = None, *, source: str | None = None,
+              status: str = "assumed", where: str = "typical value of the effect",
+              intervals: Mapping[str, tuple[float, float]] | None = None) -> EffectEntry:
+        """An entry for a model file; parameters that are not given take their typical value.
+
+        `intervals` (confidence intervals) become the entry's bounds, otherwise the effect's own bounds do.
+        """
+        values = dict(values or {})
+        unknown = sorted(set(values) - {p.name for p in cls.parameters})
+        if unknown:
+            raise HannesError(f"Effect '{cls.name}' has no parameter {', '.join(unknown)}; "
+                              f"valid are {', '.join(p.name for p in cls.parameters)}.")
+        entries = {}
+        for p in cls.parameters:
+            value = float(values.get(p.name, p.typical))
+            if not p.lower <= value <= p.upper:
+                raise HannesError(f"Effect '{cls.name}': {p.name} = {value} {p.unit} is outside "
+                                  f"[{p.lower}, {p.upper}].")
+            low, high = (intervals or {}).get(p.name, (p.lower, p.upper))
+            entries[p.name] = Parameter(value, p.unit, min(low, value), max(high, value), status, where)
+        return EffectEntry(cls.name, entries, source)
+
+
+EffectType = type[Effect]
+
+
+def check_effect(effect: EffectType, where: str) -> EffectType:
+    """Check a declaration once; errors say what is wrong with which effect."""
+    if not effect.name or not effect.name.isidentifier():
+        raise HannesError(f"{where}: the effect needs a `name` that is an identifier, not {effect.name!r}.")
+    if not effect.parameters:
+        raise HannesError(f"{where}: effect '{effect.name}' declares no parameters.")
+    if all(p.vanishing is None for p in effect.parameters):
+        raise HannesError(f"{where}: effect '{effect.name}' needs a parameter with a `vanishing` value (off).")
+    if "contribute" not in effect.__dict__ and all("contribute" not in b.__dict__ for b in effect.__mro__[:-2]):
+        raise HannesError(f"{where}: effect '{effect.name}' defines no `contribute(x, p, s, y)`.")
+    return effect
+
+
+def _effects_in(module: ModuleType) -> list[EffectType]:
+    return [c for _, c in inspect.getmembers(module, inspect.isclass)
+            if issubclass(c, Effect) and c is not Effect and c.__module__ == module.__name__ and c.name]
+
+
+@cache
+def catalogue() -> Mapping[str, EffectType]:
+    """All effects by name: the files of hannes_sim/effects and the entry points of other packages."""
+    found: dict[str, EffectType] = {}
+    package = importlib.import_module("hannes_sim.effects")
+    for info in sorted(pkgutil.iter_modules(package.__path__), key=lambda i: i.name):
+        for effect in _effects_in(importlib.import_module(f"hannes_sim.effects.{info.name}")):
+            found[effect.name] = check_effect(effect, f"hannes_sim/effects/{info.name}.py")
+    for point in entry_points(group=ENTRY_POINTS):
+        effect = check_effect(point.load(), f"entry point {point.value}")
+        if effect.name in found:
+            raise HannesError(f"Entry point {point.value}: an effect named '{effect.name}' exists already; rename it.")
+        found[effect.name] = effect
+    return found
+
+
+@lru_cache(maxsize=256)
+def load_effect(name_or_source: str) -> EffectType:
+    """An effect by catalogue name, or a user's own by `path.py:Class` (the file is executed, as any import is)."""
+    if ":" not in name_or_source:
+        found = catalogue()
+        if name_or_source not in found:
+            raise HannesError(f"Unknown effect '{name_or_source}'; the catalogue has {', '.join(sorted(found))}; "
+                              "an own effect is given as path.py:Class.")
+        return found[name_or_source]
+    file, _, class_name = name_or_source.rpartition(":")
+    effect = load_class(file, class_name, "effect")
+    if not (inspect.isclass(effect) and issubclass(effect, Effect)):
+        raise HannesError(f"'{class_name}' in '{file}' is not a subclass of hannes_sim.effect.Effect.")
+    return check_effect(effect, file)
+
+
+def load_class(file: str, class_name: str, what: str) -> Any:
+    """An attribute of a user's own Python file; the file is executed once per process."""
+    path = Path(file).expanduser().resolve()
+    if not path.is_file():
+        raise HannesError(f"No file '{file}' for the {what} '{class_name}'; give path.py:Class.")
+    module_name = f"hannes_user_{abs(hash(str(path))):x}"
+    if module_name in sys.modules:
+        module = sys.modules[module_name]
+    else:
+        spec = importlib.util.spec_from_file_location(module_name, path)
+        if spec is None or spec.loader is None:
+            raise HannesError(f"'{file}' cannot be loaded as a Python module.")
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[module_name] = module
+        try:
+            spec.loader.exec_module(module)
+        except Exception as error:  # whatever a user's file raises is reported as one clear error
+            del sys.modules[module_name]
+            raise HannesError(f"'{file}' cannot be imported: {type(error).__name__}: {error}.") from error
+    if not hasattr(module, class_name):
+        names = ", ".join(c.__name__ for _, c in inspect.getmembers(module, inspect.isclass)
+                          if c.__module__ == module_name)
+        raise HannesError(f"'{file}' has no '{class_name}'; it has {names or 'no classes'}.")
+    return getattr(module, class_name)
+
+
+@cache
+def compile_effect(effect: EffectType) -> Any:
+    """The compiled C function of an effect (kept alive by the cache); `.address` is what a plant calls."""
+    try:
+        return cfunc(EFFECT_SIGNATURE, cache=_cacheable(effect))(effect.contribute)
+    except Exception as error:  # numba's errors are long; the user needs the effect and the reason
+        reason = str(error).strip().splitlines()
+        raise HannesError(f"Effect '{effect.name}': contribute(x, p, s, y) cannot be compiled: "
+                          f"{type(error).__name__}: {reason[0] if reason else ''} (plain arithmetic, math functions "
+                          "and the constants of hannes_sim.ports are allowed).") from error
+
+
+def _cacheable(effect: EffectType) -> bool:
+    # The disk cache is keyed by file and time stamp of its directory; a user's folder may be read-only.
+    return effect.__module__.startswith("hannes_sim.")
+
+
+class BoundEffects:
+    """The active effects of a plant: their functions, parameters and states as flat buffers.
+
+    table       int64 (1 + 3 n): count, then the addresses (function, parameters, states) of each
+    parameters  float64, concatenated; change in place with `set`
+    states      float64, concatenated; zeroed by the plant's reset
+    """
+
+    def __init__(self, effects: tuple[tuple[EffectType, Mapping[str, float]], ...]) -> None:
+        self.effects = tuple(effect for effect, _ in effects)
+        self.index = {(effect.name, p.name): 0 for effect in self.effects for p in effect.parameters}
+        self._functions = [compile_effect(effect) for effect in self.effects]
+        n_parameters = sum(len(effect.parameters) for effect in self.effects)
+        self.parameters: NDArray[np.float64] = np.zeros(max(1, n_parameters))
+        self.states: NDArray[np.float64] = np.zeros(max(1, sum(effect.states for effect in self.effects)))
+        self.table: NDArray[np.int64] = np.zeros(1 + 3 * len(self.effects), dtype=np.int64)
+        self.table[0] = len(self.effects)
+        at_p = at_s = 0
+        for k, (effect, values) in enumerate(effects):
+            self.table[1 + 3 * k] = self._functions[k].address
+            self.table[2 + 3 * k] = self.parameters.ctypes.data + 8 * at_p
+            self.table[3 + 3 * k] = self.states.ctypes.data + 8 * at_s
+            for j, p in enumerate(effect.parameters):
+                self.index[(effect.name, p.name)] = at_p + j
+                self.parameters[at_p + j] = values.get(p.name, p.typical)
+            at_p += len(effect.parameters)
+            at_s += effect.states
+
+    def set(self, effect: str, parameter: str, value: float) -> None:
+        """Change one parameter of an active effect."""
+        self.parameters[self.index[(effect, parameter)]] = value
+
+    @classmethod
+    def of(cls, entries: tuple[EffectEntry, ...]) -> BoundEffects:
+        return cls(tuple((load_effect(e.source or e.name), e.values) for e in entries))
+
+
+def evaluate(effect: EffectType, values: Mapping[str, float], inputs: Mapping[int, float],
+             states: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Outputs (N_OUTPUTS,) of one effect for given inputs, in plain Python; for tests and pictures."""
+    x = np.zeros(N_INPUTS)
+    for index, value in inputs.items():
+        x[index] = value
+    y = np.zeros(N_OUTPUTS)
+    s = np.zeros(max(1, effect.states)) if states is None else states
+    effect.contribute(x, np.array([values.get(p.name, p.typical) for p in effect.parameters]), s, y)
+    return y
+
+
+def effect_source(effect: EffectType, given: str) -> str | None:
+    """What a model file stores so that the effect is found again: None for the catalogue, else an absolute path:Class."""
+    if ":" not in given:
+        return None
+    file, _, class_name = given.rpartition(":")
+    return f"{Path(file).expanduser().resolve()}:{class_name}"
+
+
+EffectFunction = Callable[[Any, Any, Any, Any], None]

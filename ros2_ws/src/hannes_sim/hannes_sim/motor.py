@@ -1,0 +1,117 @@
+"""What every plant has in common at its drive: effects, command delay, electrical motor, sensors."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from .native import call_effect, pointer_f8, pointer_i8
+from .ports import (
+    CURRENT, DELAY, DELAY_RING, DT, H_DELAY, H_EFFECTS, H_INPUTS, H_OUTPUTS, H_PARAMETERS, H_READING, H_STATE, KT_REL,
+    N_OUTPUTS, P_CURRENT_OFFSET, P_DELAY, P_DT, P_EFFICIENCY, P_INDUCTANCE, P_KT, P_KT_NOMINAL, P_RATIO, P_RESISTANCE,
+    P_RESOLUTION, P_SUPPLY, P_ZERO, R_CURRENT, R_EFFORT, R_POSITION, R_TIME, R_VELOCITY, RESISTANCE, RESISTANCE_REL,
+    S_CURRENT, S_DELAY_INDEX, S_POSITION_READ, S_TIME_STEPS, SENSE_CURRENT, SENSE_CURRENT_GAIN, SENSE_POSITION, SUPPLY, T,
+    V, VOLTAGE, VOLTAGE_DROP,
+)  # fmt: skip
+
+
+@njit(cache=True)
+def evaluate_effects(handle):  # type: ignore[no-untyped-def]
+    """Sum the contributions of all active effects into the outputs; the inputs must be filled before."""
+    x, y = handle[H_INPUTS], handle[H_OUTPUTS]
+    out = pointer_f8(y)
+    for k in range(N_OUTPUTS):
+        out[k] = 0.0
+    table = pointer_i8(handle[H_EFFECTS])
+    for k in range(table[0]):
+        call_effect(table[1 + 3 * k], x, table[2 + 3 * k], table[3 + 3 * k], y)
+
+
+@njit(cache=True)
+def begin_step(handle, voltage, q, v):  # type: ignore[no-untyped-def]
+    """Time, delayed and limited command, and motor position into the inputs; returns nothing.
+
+    The delay is the parameter plus the effects' DELAY of the previous step, interpolated between the stored
+    commands (one a step), so that it is continuous in the delay.
+    """
+    p, s = pointer_f8(handle[H_PARAMETERS]), pointer_f8(handle[H_STATE])
+    x, y, ring = pointer_f8(handle[H_INPUTS]), pointer_f8(handle[H_OUTPUTS]), pointer_f8(handle[H_DELAY])
+    limit = p[P_SUPPLY]
+    command = min(max(voltage, -limit), limit)
+    index = int(s[S_DELAY_INDEX])
+    ring[index] = command
+    s[S_DELAY_INDEX] = float((index + 1) % DELAY_RING)
+    steps = (p[P_DELAY] + y[DELAY]) / p[P_DT]
+    steps = min(max(steps, 0.0), DELAY_RING - 2.0)
+    if steps > 0.0:
+        whole = int(steps)
+        part = steps - whole
+        newer = ring[(index - whole) % DELAY_RING]
+        older = ring[(index - whole - 1) % DELAY_RING]
+        command = newer + part * (older - newer)
+    x[T] = s[S_TIME_STEPS] * p[P_DT]
+    x[DT] = p[P_DT]
+    x[2] = q
+    x[V] = v
+    x[CURRENT] = s[S_CURRENT]
+    x[VOLTAGE] = command
+    x[RESISTANCE] = p[P_RESISTANCE]
+    x[SUPPLY] = limit
+
+
+@njit(cache=True)
+def motor_torque(handle):  # type: ignore[no-untyped-def]
+    """Torque at the pulley [N.m] of the brushed motor after this step.
+
+    L di/dt = u - R i - Ke w, integrated exactly over the step for constant u and w (the electrical time constant,
+    about 0.1 ms, is shorter than a step); torque = efficiency kt ratio i, with the mean current of the step so that
+    the impulse is exact too.  Without inductance the current follows at once.
+    """
+    p, s = pointer_f8(handle[H_PARAMETERS]), pointer_f8(handle[H_STATE])
+    x, y = pointer_f8(handle[H_INPUTS]), pointer_f8(handle[H_OUTPUTS])
+    kt = p[P_KT] * (1.0 + y[KT_REL])
+    resistance = p[P_RESISTANCE] * (1.0 + y[RESISTANCE_REL])
+    final = (x[VOLTAGE] - y[VOLTAGE_DROP] - kt * p[P_RATIO] * x[V]) / resistance
+    before = s[S_CURRENT]
+    if p[P_INDUCTANCE] > 0.0:
+        rate = resistance / p[P_INDUCTANCE] * p[P_DT]
+        decay = math.exp(-rate)
+        after = final + (before - final) * decay
+        mean = final + (before - final) * (1.0 - decay) / rate
+    else:
+        after = final
+        mean = final
+    s[S_CURRENT] = after
+    return p[P_EFFICIENCY] * kt * p[P_RATIO] * mean
+
+
+@njit(cache=True)
+def sense(handle, q, steps):  # type: ignore[no-untyped-def]
+    """Fill time, encoder, current and effort of the reading after `steps` steps."""
+    p, s = pointer_f8(handle[H_PARAMETERS]), pointer_f8(handle[H_STATE])
+    y, out = pointer_f8(handle[H_OUTPUTS]), pointer_f8(handle[H_READING])
+    position = q + p[P_ZERO] + y[SENSE_POSITION]
+    if p[P_RESOLUTION] > 0.0:
+        position = math.floor(position / p[P_RESOLUTION] + 0.5) * p[P_RESOLUTION]
+    current = s[S_CURRENT] * (1.0 + y[SENSE_CURRENT_GAIN]) + p[P_CURRENT_OFFSET] + y[SENSE_CURRENT]
+    out[R_TIME] = s[S_TIME_STEPS] * p[P_DT]
+    out[R_VELOCITY] = (position - s[S_POSITION_READ]) / (steps * p[P_DT]) if steps > 0 else 0.0
+    out[R_POSITION] = position
+    out[R_CURRENT] = current
+    out[R_EFFORT] = p[P_KT_NOMINAL] * p[P_RATIO] * current
+    s[S_POSITION_READ] = position
+
+
+@njit(cache=True)
+def dry_friction(v_free, level, inertia, dt):  # type: ignore[no-untyped-def]
+    """Velocity after an implicit dry-friction impulse: sticks exactly, never reverses the motion.
+
+    The proximal form of Coulomb's law (Moreau): the friction impulse is at most level x dt and opposes v.
+    """
+    change = max(level, 0.0) * dt / inertia
+    if v_free > change:
+        return v_free - change
+    if v_free < -change:
+        return v_free + change
+    return 0.0

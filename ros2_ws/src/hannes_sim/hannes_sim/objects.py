@@ -1,0 +1,75 @@
+"""Objects to grasp: shape, size, place, stiffness and damping."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from hannes_description.errors import HannesError
+
+SHAPES = ("capsule", "sphere", "box")
+
+
+@dataclass(frozen=True)
+class GraspObject:
+    """An object held fixed in the palm's frame, as on a dynamometer.
+
+    shape      capsule (a bar across the fingers), sphere or box
+    size       m, what lies between fingertips and thumb when they touch it (diameter, thickness)
+    stiffness  N/m of the contact between one fingertip and the object, object and fingertip pad together
+    damping    N.s/m
+    friction   Coulomb coefficient
+    place      m, offset of its centre in the palm frame from the middle of the grasp
+    """
+
+    shape: str = "capsule"
+    size: float = 0.045
+    stiffness: float = 400.0
+    damping: float = 2.0
+    friction: float = 0.8
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.shape not in SHAPES:
+            raise HannesError(f"Object shape {self.shape!r} is unknown; valid are {', '.join(SHAPES)}.")
+        for name, low in (("size", 0.0), ("stiffness", 0.0), ("damping", -1e-12), ("friction", -1e-12)):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > low):
+                raise HannesError(f"Object {name} is {value}; it must be a finite number above {max(low, 0.0)}.")
+        if len(self.place) != 3 or not all(math.isfinite(c) for c in self.place):
+            raise HannesError(f"Object place is {self.place}; it must be three finite numbers in m.")
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"shape": self.shape, "size": self.size, "stiffness": self.stiffness, "damping": self.damping,
+                "friction": self.friction, "place": list(self.place)}
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> GraspObject:
+        unknown = sorted(set(content) - set(cls.__dataclass_fields__))
+        if unknown:
+            raise HannesError(f"Object: unknown keys {unknown}; valid are {', '.join(cls.__dataclass_fields__)}.")
+        values = dict(content)
+        if "place" in values:
+            values["place"] = tuple(float(c) for c in values["place"])
+        return cls(**values)
+
+
+SOFT_BALL = GraspObject(shape="sphere", size=0.045, stiffness=400.0, damping=2.0)
+"""A ball that deforms visibly (thesis P18): about 0.4 kN/m in all."""
+
+RIGID_DYNAMOMETER = GraspObject(shape="capsule", size=0.045, stiffness=40000.0, damping=20.0)
+"""A hand dynamometer (thesis P17): at least 40 kN/m."""
+
+OBJECTS: Mapping[str, GraspObject | None] = MappingProxyType(
+    {"none": None, "soft": SOFT_BALL, "rigid": RIGID_DYNAMOMETER})
+"""Objects by the names that nodes and the command line take."""
+
+
+def named_object(name: str) -> GraspObject | None:
+    """An object by name; None for `none`."""
+    if name not in OBJECTS:
+        raise HannesError(f"Unknown object '{name}'; valid are {', '.join(OBJECTS)}.")
+    return OBJECTS[name]

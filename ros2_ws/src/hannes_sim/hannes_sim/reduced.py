@@ -1,0 +1,216 @@
+"""The fast plant: one motor, one wire, one hand coordinate, all referred to the motor pulley.
+
+    motor side  (J + dJ) q'' = torque - tension - friction(q')          encoder here
+    wire        tension = k max(0, q - ql - slack) + b (q' - ql'), never negative
+    load side   J_h ql'' = tension - return(ql) - stops(ql) - object(ql) - friction(ql')
+
+return(ql) = preload + stiffness ql; the object is a spring and damper that pushes back only.  Dry friction is solved
+implicitly (it sticks exactly), the rest semi-implicitly.  A wire of zero stiffness switches the load side off: a single
+mass with a motor, which is what many single-drive machines are.
+
+Limits: no single fingers, no gravity along the motion, constant moment arms; the MuJoCo plant has these.
+Source of the structure: thesis section 4, "at the pulley"; of the friction form: dry_friction in motor.py.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import cfunc
+from numpy.typing import NDArray
+
+from hannes_description.errors import HannesError
+from hannes_description.joints import JOINT_LIMITS, JOINT_NAMES
+from hannes_description.model import Model
+
+from .effect import BoundEffects
+from .motor import begin_step, dry_friction, evaluate_effects, motor_torque, sense
+from .native import ADVANCE_SIGNATURE, pointer_f8
+from .objects import GraspObject
+from .plant import DEFAULT_DT, PlantDiverged, Reading
+from .ports import (
+    COMPLIANCE, CONTACT, DAMPING, DELAY_RING, FRICTION, H_INPUTS, H_OUTPUTS, H_PARAMETERS, H_READING, H_STATE, INERTIA,
+    LOAD, LOAD_DAMPING, LOAD_FRICTION, LOAD_TORQUE, N_HANDLE_COMMON, N_INPUTS, N_JOINTS, N_OUTPUTS, N_PARAMETERS_COMMON,
+    N_READING, N_STATE_COMMON, OBJECT_DAMPING, P_CURRENT_OFFSET, P_DELAY, P_DT, P_EFFICIENCY, P_INDUCTANCE, P_INERTIA,
+    P_KT, P_KT_NOMINAL, P_RATIO, P_RESISTANCE, P_RESOLUTION, P_SUPPLY, P_ZERO, QL, R_FORCE, R_JOINTS, R_LOAD, R_Q, R_QL,
+    R_WARNING, S_CONTACT, S_LOAD, S_TIME_STEPS, SLACK, TORQUE, VL,
+)  # fmt: skip
+
+# Parameters of this plant, after the common ones
+_COULOMB, _VISCOUS, _WIRE_K, _WIRE_B, _J_LOAD, _PRELOAD, _STIFFNESS, _LOAD_COULOMB, _LOAD_VISCOUS, _TRAVEL, _STOP_K, \
+    _OBJECT_K, _OBJECT_B, _OBJECT_AT, _TIP = range(N_PARAMETERS_COMMON, N_PARAMETERS_COMMON + 15)
+_N_PARAMETERS = N_PARAMETERS_COMMON + 15
+
+# States of this plant, after the common ones
+_SQ, _SV, _SQL, _SVL = range(N_STATE_COMMON, N_STATE_COMMON + 4)
+_N_STATES = N_STATE_COMMON + 4
+
+NO_OBJECT = 1e9
+"""rad; where the object is when there is none."""
+
+
+def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
+    p, s = pointer_f8(handle[H_PARAMETERS]), pointer_f8(handle[H_STATE])
+    x, y, out = pointer_f8(handle[H_INPUTS]), pointer_f8(handle[H_OUTPUTS]), pointer_f8(handle[H_READING])
+    dt = p[P_DT]
+    q, v, ql, vl = s[_SQ], s[_SV], s[_SQL], s[_SVL]
+    load, contact = s[S_LOAD], s[S_CONTACT]
+    for _ in range(steps):
+        begin_step(handle, voltage, q, v)
+        x[QL], x[VL], x[LOAD], x[CONTACT] = ql, vl, load, contact
+        evaluate_effects(handle)
+        torque = motor_torque(handle) + y[TORQUE]
+
+        if p[_WIRE_K] > 0.0:
+            stretch = q - ql - y[SLACK]
+            load = 0.0
+            if stretch > 0.0:
+                stiffness = 1.0 / (1.0 / p[_WIRE_K] + max(0.0, y[COMPLIANCE]))
+                load = max(0.0, stiffness * stretch + p[_WIRE_B] * (v - vl))
+            depth = ql - p[_OBJECT_AT]
+            contact = 0.0
+            if depth > 0.0:
+                contact = max(0.0, p[_OBJECT_K] * depth + (p[_OBJECT_B] + y[OBJECT_DAMPING]) * vl)
+            force = load - p[_PRELOAD] - p[_STIFFNESS] * ql - contact + y[LOAD_TORQUE]
+            if ql < 0.0:
+                force -= p[_STOP_K] * ql
+            elif ql > p[_TRAVEL]:
+                force -= p[_STOP_K] * (ql - p[_TRAVEL])
+            damping = p[_LOAD_VISCOUS] + y[LOAD_DAMPING]
+            inertia = p[_J_LOAD] + dt * damping
+            vl = dry_friction((p[_J_LOAD] * vl + dt * force) / inertia, p[_LOAD_COULOMB] + y[LOAD_FRICTION], inertia, dt)
+            ql += dt * vl
+        else:
+            ql, vl, load = q, v, 0.0
+            torque += y[LOAD_TORQUE]
+
+        inertia = p[P_INERTIA] + y[INERTIA]
+        damped = inertia + dt * (p[_VISCOUS] + y[DAMPING])
+        v = dry_friction((inertia * v + dt * (torque - load)) / damped, p[_COULOMB] + y[FRICTION], damped, dt)
+        q += dt * v
+        s[S_TIME_STEPS] += 1.0
+    s[_SQ], s[_SV], s[_SQL], s[_SVL] = q, v, ql, vl
+    s[S_LOAD], s[S_CONTACT] = load, contact
+    sense(handle, q, steps)
+    out[R_FORCE] = contact / p[_TIP] if p[_TIP] > 0.0 else 0.0
+    out[R_Q], out[R_QL], out[R_LOAD] = q, ql, load
+    out[R_WARNING] = 0.0 if math.isfinite(q) and math.isfinite(ql) and abs(v) < 1e6 else 1.0
+
+
+_compiled = cfunc(ADVANCE_SIGNATURE, cache=True)(_advance)
+
+# Finger joints of the closed hand; the long fingers' abduction is passive and stays in the middle.
+_CLOSED = np.array([0.0 if name.endswith("_abd") and not name.startswith("thumb") else JOINT_LIMITS[name].upper
+                    for name in JOINT_NAMES])
+
+_NAMES = {
+    "supply.voltage": P_SUPPLY, "motor.resistance": P_RESISTANCE, "motor.inductance": P_INDUCTANCE, "motor.kt": P_KT,
+    "gear.ratio": P_RATIO, "gear.efficiency": P_EFFICIENCY, "encoder.resolution": P_RESOLUTION,
+    "encoder.zero": P_ZERO, "current.offset": P_CURRENT_OFFSET, "command.delay": P_DELAY, "friction.coulomb": _COULOMB,
+    "friction.viscous": _VISCOUS, "wire.stiffness": _WIRE_K, "wire.damping": _WIRE_B, "hand.inertia": _J_LOAD,
+    "hand.preload": _PRELOAD, "hand.stiffness": _STIFFNESS, "hand.coulomb": _LOAD_COULOMB,
+    "hand.viscous": _LOAD_VISCOUS, "hand.travel": _TRAVEL, "hand.stop_stiffness": _STOP_K,
+    "hand.fingertip_travel": _TIP,
+}
+_OBJECT_NAMES = {"object.stiffness": _OBJECT_K, "object.damping": _OBJECT_B, "object.position": _OBJECT_AT}
+
+
+class ReducedPlant:
+    """The reduced plant of a model; see the module's docstring for its equations."""
+
+    def __init__(self, model: Model, grasp: GraspObject | None = None, *, dt: float = DEFAULT_DT) -> None:
+        if not (math.isfinite(dt) and 0.0 < dt <= 1e-2):
+            raise HannesError(f"The integration step is {dt} s; it must lie in (0, 0.01].")
+        self.dt = dt
+        self.effects = BoundEffects.of(model.effects)
+        self.parameters: NDArray[np.float64] = np.zeros(_N_PARAMETERS)
+        self.states: NDArray[np.float64] = np.zeros(_N_STATES)
+        self.reading: NDArray[np.float64] = np.zeros(N_READING)
+        self._inputs = np.zeros(N_INPUTS)
+        self._outputs = np.zeros(N_OUTPUTS)
+        self._delay = np.zeros(DELAY_RING)
+        self.handle: NDArray[np.int64] = np.zeros(N_HANDLE_COMMON, dtype=np.int64)
+        self.handle[:] = [a.ctypes.data for a in (self.parameters, self.states, self.reading, self._inputs,
+                                                  self._outputs, self.effects.table, self._delay)]
+        self.address: int = _compiled.address
+        self._call = _compiled.ctypes
+        self._handle_pointer = self.handle.ctypes.data_as(self._call.argtypes[0])
+
+        self.parameters[P_DT] = dt
+        values = model.parameters
+        for name, index in _NAMES.items():
+            if name in values:
+                self.parameters[index] = values.value(name)
+        self.parameters[P_KT_NOMINAL] = values.value("motor.kt")
+        self._armature = values.value("motor.armature")
+        self._update_inertia()
+        self.parameters[_OBJECT_AT] = NO_OBJECT
+        if grasp is not None:
+            travel = values.value("hand.fingertip_travel")
+            # A fingertip travels `travel` per rad of pulley, so k at the pulley = k travel^2; contact where the
+            # opening that is left equals the object's size.
+            self.parameters[_OBJECT_K] = grasp.stiffness * travel**2
+            self.parameters[_OBJECT_B] = grasp.damping * travel**2
+            self.parameters[_OBJECT_AT] = values.value("hand.travel") - grasp.size / travel
+        self.reset()
+
+    def _update_inertia(self) -> None:
+        self.parameters[P_INERTIA] = self._armature * self.parameters[P_RATIO] ** 2
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        effects = tuple(f"{effect}.{parameter}" for effect, parameter in self.effects.index)
+        return (*_NAMES, *_OBJECT_NAMES, "motor.armature", *effects)
+
+    def set(self, name: str, value: float) -> None:
+        if name in _NAMES or name in _OBJECT_NAMES:
+            self.parameters[_NAMES.get(name, _OBJECT_NAMES.get(name, 0))] = value
+        elif name == "motor.armature":
+            self._armature = value
+        elif tuple(name.split(".", 1)) in self.effects.index:
+            effect, parameter = name.split(".", 1)
+            self.effects.set(effect, parameter, value)
+        else:
+            raise HannesError(f"The reduced plant has no parameter '{name}'; valid are {', '.join(self.names)}.")
+        self._update_inertia()
+
+    def get(self, name: str) -> float:
+        """The present value of a parameter that `set` takes."""
+        if name in _NAMES or name in _OBJECT_NAMES:
+            return float(self.parameters[_NAMES.get(name, _OBJECT_NAMES.get(name, 0))])
+        if name == "motor.armature":
+            return self._armature
+        effect, _, parameter = name.partition(".")
+        if (effect, parameter) in self.effects.index:
+            return float(self.effects.parameters[self.effects.index[(effect, parameter)]])
+        raise HannesError(f"The reduced plant has no parameter '{name}'; valid are {', '.join(self.names)}.")
+
+    def reset(self) -> None:
+        self.states[:] = 0.0
+        self.effects.states[:] = 0.0
+        self._outputs[:] = 0.0
+        self._delay[:] = 0.0
+        self.reading[:] = 0.0
+        self._call(self._handle_pointer, 0.0, 0)
+        self._joints()
+
+    def _joints(self) -> None:
+        share = self.reading[R_QL] / self.parameters[_TRAVEL] if self.parameters[_TRAVEL] > 0.0 else 0.0
+        rate = self.states[_SVL] / self.parameters[_TRAVEL] if self.parameters[_TRAVEL] > 0.0 else 0.0
+        self.reading[R_JOINTS:R_JOINTS + N_JOINTS] = share * _CLOSED
+        self.reading[R_JOINTS + N_JOINTS:] = rate * _CLOSED
+
+    def advance(self, voltage: float, steps: int) -> None:
+        self._call(self._handle_pointer, voltage, steps)
+        self.check()
+        self._joints()
+
+    def check(self) -> None:
+        if self.reading[R_WARNING] != 0.0:
+            which = "motor pulley" if not math.isfinite(self.reading[R_Q]) else "hand coordinate"
+            raise PlantDiverged(f"The reduced plant diverged at t = {self.states[S_TIME_STEPS] * self.dt:.4f} s "
+                                f"({which}); reduce dt or check the parameters' magnitudes.")
+
+    def read(self) -> Reading:
+        return Reading.of(self.reading)
