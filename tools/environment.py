@@ -110,7 +110,7 @@ def prepare(venv: Path) -> None:
 
 
 def pip_install(python: Path, *arguments: str) -> None:
-    quiet = ["--quiet", "--disable-pip-version-check", "--progress-bar", "off"]
+    quiet = ["-qq", "--disable-pip-version-check", "--progress-bar", "off"]
     subprocess.run(
         [str(python), "-m", "pip", "install", *quiet, *arguments], check=True, stdin=subprocess.DEVNULL
     )
@@ -120,8 +120,8 @@ def make_venv(venv: Path, apt_ros: bool) -> None:
     python = APT_PYTHON if apt_ros and not os.environ.get("PYTHON") else find_python()
     if not runs(python, "import ensurepip, venv"):
         raise SetupError(
-            f"{python} cannot make virtual environments: its module ensurepip is missing. On Debian and "
-            f"Ubuntu: `sudo apt install python3-venv` (or python{version_of(python)}-venv), then run this again."
+            f"{python} cannot make virtual environments: its module ensurepip is missing. On Debian "
+            f"and Ubuntu: `apt install python3-venv` (or python{version_of(python)}-venv), then run again."
         )
     say(f"making {venv} with {python}" + (" beside the sourced ROS 2 Jazzy" if apt_ros else ""))
     options = ["--system-site-packages"] if apt_ros else []
@@ -141,8 +141,8 @@ def find_python() -> str:
             f"{name}: {'not found' if path is None else f'Python {version}' if version else 'does not run'}"
         )
     raise SetupError(
-        f"Python 3.11 or 3.12 is needed, but: {'; '.join(seen)}. Install one (apt install python3 python3-venv "
-        "on Debian 12 or Ubuntu 24.04) or name it: `make demo PYTHON=/path/to/python3.12`."
+        f"Python 3.11 or 3.12 is needed, but: {'; '.join(seen)}. Install one (apt install python3 "
+        "python3-venv on Debian 12 or Ubuntu 24.04) or name it: `make demo PYTHON=/path/to/python3.12`."
     )
 
 

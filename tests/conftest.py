@@ -1,0 +1,84 @@
+"""What all tests share: a ROS 2 of one's own for each test, and where the outside data are."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+# Read by ROS 2 when the first node of the process starts, so set before any test: this host only; UDP, since the
+# shared memory of a killed process holds up the next discovery for seconds; leases of half a second.
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
+os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(REPOSITORY / "tests" / "fastdds.xml"))
+os.environ.setdefault("RCUTILS_COLORIZED_OUTPUT", "0")
+if not os.environ.get("AMENT_PREFIX_PATH"):
+    # the wheels put ROS 2 into the environment itself, which so is a prefix of the ament index
+    os.environ["AMENT_PREFIX_PATH"] = sys.prefix
+
+FIRST_DOMAIN, LAST_DOMAIN = 1, 101
+# A process that uses domain d holds this TCP port plus d, below the ports that the kernel hands out
+DOMAIN_LOCK_PORT = 24300
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The root of the repository."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def hannes_data() -> Path:
+    """The folder of outside data (EMG recordings, the EMPS bench): HANNES_DATA, else ../shared/data."""
+    folder = Path(os.environ.get("HANNES_DATA") or REPOSITORY.parent / "shared" / "data")
+    if not folder.is_dir():
+        pytest.skip(f"no outside data in {folder}; set HANNES_DATA to the folder that holds emg/ and emps/")
+    return folder
+
+
+@pytest.fixture
+def ros_domain_id() -> Iterator[int]:
+    """A ROS domain id that no other test on this machine uses, held while the test runs."""
+    # start at a place of one's own, so that processes seldom try the same
+    span = LAST_DOMAIN - FIRST_DOMAIN + 1
+    for step in range(span):
+        domain = FIRST_DOMAIN + (os.getpid() * 7 + step) % span
+        lock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            lock.bind(("127.0.0.1", DOMAIN_LOCK_PORT + domain))
+        except OSError:
+            lock.close()
+            continue
+        try:
+            yield domain
+        finally:
+            lock.close()
+        return
+    pytest.fail(f"all ROS domain ids from {FIRST_DOMAIN} to {LAST_DOMAIN} are in use by other tests")
+
+
+@pytest.fixture
+def ros_environment(ros_domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """The environment of the test's nodes, set in this process too: a domain id and a log folder of its own."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain_id))
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "ros_log"))
+    monkeypatch.setenv("PYTHONUNBUFFERED", "1")
+    return dict(os.environ)
+
+
+@pytest.fixture
+def ros_context(ros_environment: dict[str, str], ros_domain_id: int) -> Iterator[object]:
+    """An rclpy Context on the test's domain id, shut down afterwards."""
+    import rclpy
+    from rclpy.context import Context
+
+    context = Context()
+    rclpy.init(args=[], context=context, domain_id=ros_domain_id)
+    yield context
+    rclpy.try_shutdown(context=context)
