@@ -25,7 +25,6 @@ test: setup ## all tests
 
 check: setup ## ruff and mypy
 	@$(BIN)/ruff check .
-	@$(BIN)/ruff format --check --quiet . || echo "(ruff format would change files; not an error)"
 	@$(BIN)/mypy --config-file pyproject.toml
 
 bench: setup ## speed and identification benchmarks, as ratios in one run

@@ -12,8 +12,8 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
-# Read by ROS 2 when the first node of the process starts, so set before any test: this host only; UDP, since the
-# shared memory of a killed process holds up the next discovery for seconds; leases of half a second.
+# Read by ROS 2 when the first node of the process starts, so set before any test: this host only; UDP, since
+# the shared memory of a killed process holds up the next discovery for seconds; early announcements.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
 os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(REPOSITORY / "tests" / "fastdds.xml"))
@@ -65,7 +65,7 @@ def ros_domain_id() -> Iterator[int]:
 
 @pytest.fixture
 def ros_environment(ros_domain_id: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """The environment of the test's nodes, set in this process too: a domain id and a log folder of its own."""
+    """The environment of the test's nodes, set in this process too: a domain id and log folder of its own."""
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain_id))
     monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "ros_log"))
     monkeypatch.setenv("PYTHONUNBUFFERED", "1")
