@@ -1,0 +1,404 @@
+"""Bag -> Recording.
+
+Topics are recognised by their canonical name under any namespace, joints by their name, types exactly. JointState
+messages count at their header stamp, header-less ones at their log time; `clocks` says what happens if those are two
+clocks. What is wrong with the file or the data is one HannesError; what is merely suspicious is a sentence in
+`metadata["warnings"]`.
+"""
+
+from __future__ import annotations
+
+import warnings as python_warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hannes_description.errors import HannesError
+from hannes_description.joints import ENCODER_JOINT, JOINT_NAMES
+from hannes_description.signals import SIGNALS, Signal
+
+from . import cdr
+from .clocks import SAME_NS, ClockRelation, relate
+from .mcap_file import Limits
+from .recording import Channel, Recording
+from .storage import BagMessages, TopicEntry, locate
+
+IntArray = npt.NDArray[np.int64]
+
+RESERVED = ("warnings", "bag", "clock", "start_ns")
+"""Metadata entries that reading sets; they are not written back."""
+
+_FIELDS = {"position": "position", "velocity": "velocity", "effort": "effort"}
+_ENCODER_TOPIC = SIGNALS["encoder_position"].topic
+_JOINTS_TOPIC = SIGNALS["joint_positions"].topic
+
+_PLAUSIBLE: Mapping[str, tuple[float, str]] = {
+    "encoder_position": (1000.0, "encoder counts (40000 counts are 14.57 rad)"),
+    "reference_position": (1000.0, "encoder counts (40000 counts are 14.57 rad)"),
+    "encoder_velocity": (10_000.0, "counts/s"),
+    "joint_positions": (4.0, "degrees"),
+    "motor_current": (100.0, "mA"),
+    "motor_voltage": (100.0, "mV or a duty in per mille"),
+    "emg_flexor": (5.0, "mV, uV or ADC counts"),
+    "emg_extensor": (5.0, "mV, uV or ADC counts"),
+    "grip_force": (1000.0, "mN or g"),
+}
+"""Greatest range (for positions) or magnitude that SI units let expect, and what a greater one may be."""
+_DEGREES = 60.0
+
+
+@dataclass(frozen=True)
+class BagInfo:
+    """What a bag holds, without decoding its messages: times in ns on the recorder's clock."""
+
+    path: str
+    storage: str
+    files: tuple[str, ...]
+    sha256: str
+    message_count: int
+    start_ns: int
+    end_ns: int
+    topics: tuple[TopicEntry, ...]
+    metadata: Mapping[str, Any]
+
+    @property
+    def duration(self) -> float:
+        """s"""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+
+def bag_info(path: str | Path, *, limits: Limits | None = None) -> BagInfo:
+    """Read a bag once and tell what it holds; raises HannesError if it is not intact."""
+    bag = locate(path)
+    messages = BagMessages(bag, limits or Limits())
+    first, last = 2**63, 0
+    for _, log_ns, _ in messages:
+        first, last = min(first, log_ns), max(last, log_ns)
+    count = sum(messages.counts.values())
+    return BagInfo(
+        path=str(path),
+        storage=bag.storage,
+        files=tuple(file.name for file in bag.files),
+        sha256=bag.sha256(),
+        message_count=count,
+        start_ns=first if count else 0,
+        end_ns=last if count else 0,
+        topics=messages.entries(),
+        metadata=dict(messages.metadata),
+    )
+
+
+def read_bag(
+    path: str | Path, *, topics: Mapping[str, str | None] | None = None, limits: Limits | None = None
+) -> Recording:
+    """Read a rosbag2 bag (folder, .mcap or .db3 file) into a Recording.
+
+    topics  by signal name (or canonical topic), the topic that carries it where the name says it differently, or where
+            two topics might be meant; None leaves the signal out
+    limits  how much is read at most; by default 6 million messages and 1 GiB
+
+    Raises HannesError: unreadable or damaged bag, ambiguous or missing topic, wrong type, undecodable message, NaN,
+    stamps that go back.
+    """
+    bag = locate(path)
+    messages = BagMessages(bag, limits or Limits())
+    raw: dict[str, cdr.RawTopic] = {}
+    wanted: dict[str, bool] = {}
+    overrides = _overrides(topics or {})
+    named = set(filter(None, overrides.values()))
+    for topic, log_ns, data in messages:
+        if topic not in wanted:
+            wanted[topic] = topic in named or _canonical_of(topic) is not None
+        if wanted[topic]:
+            raw.setdefault(topic, cdr.RawTopic()).append(log_ns, data)
+    if not messages.counts:
+        raise HannesError(f"The bag {path} holds no message.")
+    return _Reader(str(path), messages, raw, overrides).recording(bag.sha256())
+
+
+def _overrides(topics: Mapping[str, str | None]) -> dict[str, str | None]:
+    """By canonical topic, the bag's topic that stands for it."""
+    known = {signal.topic for signal in SIGNALS.values()}
+    resolved: dict[str, str | None] = {}
+    for key, topic in topics.items():
+        canonical = SIGNALS[key].topic if key in SIGNALS else key
+        if canonical not in known:
+            raise HannesError(f"topics: unknown signal {key!r}. Known signals: {', '.join(SIGNALS)}.")
+        name = None if topic is None else "/" + topic.strip("/")
+        if resolved.get(canonical, name) != name:
+            raise HannesError(f"topics: two topics are named for {canonical}: {resolved[canonical]} and {name}.")
+        resolved[canonical] = name
+    return resolved
+
+
+def _canonical_of(topic: str) -> str | None:
+    name = "/" + topic.strip("/")
+    found = [signal.topic for signal in SIGNALS.values() if name.endswith("/" + signal.topic)]
+    return max(found, key=len) if found else None
+
+
+class _Reader:
+    """Makes the channels of one bag; holds what the steps share."""
+
+    def __init__(
+        self,
+        path: str,
+        messages: BagMessages,
+        raw: Mapping[str, cdr.RawTopic],
+        overrides: Mapping[str, str | None],
+    ) -> None:
+        self.path = path
+        self.messages = messages
+        self.raw = raw
+        self.overrides = overrides
+        self.warnings: list[str] = []
+
+    def recording(self, sha256: str) -> Recording:
+        chosen = self._choose()
+        if not chosen:
+            present = ", ".join(f"{entry.name} ({entry.type})" for entry in self.messages.entries())
+            wanted = ", ".join(dict.fromkeys(signal.topic for signal in SIGNALS.values()))
+            raise HannesError(
+                f"The bag {self.path} has none of the topics {wanted}, under any namespace. It has: {present}. "
+                "Name the topics with topics={signal: topic}."
+            )
+        states = {topic: self._decode(topic, cdr.decode_joint_states) for topic in chosen.values() if self._is(topic)}
+        relation = self._relation(states)
+        samples: dict[str, tuple[IntArray, npt.NDArray[Any]]] = {}
+        for canonical, topic in chosen.items():
+            signals = [signal for signal in SIGNALS.values() if signal.topic == canonical]
+            if topic in states:
+                self._joint_channels(topic, signals, states[topic], relation, samples)
+            else:
+                times, values = self._plain(topic, signals[0])
+                samples[signals[0].name] = (relation.apply(times), values)
+        ordered = {name: self._in_order(name, *samples[name]) for name in SIGNALS if name in samples}
+        if not ordered:
+            raise HannesError(f"The bag {self.path} has no usable signal. " + " ".join(self.warnings))
+        return self._assemble(ordered, chosen, relation, sha256)
+
+    def _choose(self) -> dict[str, str]:
+        """By canonical topic, the bag's topic that carries it."""
+        chosen: dict[str, str] = {}
+        for canonical in dict.fromkeys(signal.topic for signal in SIGNALS.values()):
+            if canonical in self.overrides:
+                named = self.overrides[canonical]
+                if named is None:
+                    continue
+                if named not in self.raw:
+                    present = ", ".join(self.messages.types)
+                    raise HannesError(f"The bag {self.path} has no message on {named}. Its topics: {present}.")
+                chosen[canonical] = named
+                continue
+            taken = set(self.overrides.values())
+            candidates = sorted(topic for topic in self.raw if _canonical_of(topic) == canonical and topic not in taken)
+            if len(candidates) > 1:
+                raise HannesError(
+                    f"The bag {self.path} has several topics that may be {canonical}: {', '.join(candidates)}. "
+                    f"Say which one with topics={{{canonical!r}: {candidates[0]!r}}}."
+                )
+            if candidates:
+                chosen[canonical] = candidates[0]
+        for canonical, topic in chosen.items():
+            expected = next(signal.type for signal in SIGNALS.values() if signal.topic == canonical)
+            if self.messages.types[topic] != expected:
+                raise HannesError(
+                    f"The bag {self.path}: topic {topic} is a {self.messages.types[topic]}, but {canonical} is a "
+                    f"{expected}. Name another topic, or leave it out with topics={{{canonical!r}: None}}."
+                )
+        return chosen
+
+    def _is(self, topic: str) -> bool:
+        return self.messages.types[topic] == cdr.JOINT_STATE
+
+    def _decode(self, topic: str, decode: Any) -> Any:
+        try:
+            return decode(self.raw[topic])
+        except cdr.CdrError as error:
+            raise HannesError(
+                f"The bag {self.path}: message {error.index} on {topic} cannot be read as "
+                f"{self.messages.types[topic]}: {error.what}."
+            ) from None
+
+    def _plain(self, topic: str, signal: Signal) -> tuple[IntArray, npt.NDArray[Any]]:
+        decoders = {
+            cdr.FLOAT64: cdr.decode_float64,
+            cdr.STRING: lambda raw: np.array(cdr.decode_strings(raw)),
+            cdr.FLOAT64_MULTI_ARRAY: cdr.decode_multi_arrays,
+        }
+        return self._log_ns(topic), self._decode(topic, decoders[signal.type])
+
+    def _log_ns(self, topic: str) -> IntArray:
+        return np.frombuffer(self.raw[topic].log_ns, dtype=np.int64)
+
+    def _stamped(self, topic: str, blocks: list[cdr.JointStates]) -> tuple[IntArray, IntArray] | None:
+        """(stamps, log times) in the order of the topic; None if its publisher does not stamp."""
+        indices = np.concatenate([block.indices for block in blocks])
+        stamps = np.concatenate([block.stamp_ns for block in blocks])[np.argsort(indices, kind="stable")]
+        if not stamps.any() and len(stamps) > 1:
+            self.warnings.append(f"The messages on {topic} carry no stamp: the recorder's times were used.")
+            return None
+        return stamps, self._log_ns(topic)
+
+    def _relation(self, states: dict[str, list[cdr.JointStates]]) -> ClockRelation:
+        """The encoder's stamps lead; other stamped topics are checked against them."""
+        self.stamps: dict[str, IntArray] = {}
+        leading: ClockRelation | None = None
+        for topic, blocks in states.items():
+            pair = self._stamped(topic, blocks)
+            if pair is None:
+                continue
+            stamps, log_ns = pair
+            if leading is None:
+                leading = relate(topic, stamps, log_ns)
+                if sentence := leading.sentence():
+                    self.warnings.append(sentence)
+            elif abs(int(np.median(leading.apply(log_ns) - stamps))) >= SAME_NS:
+                self.warnings.append(
+                    f"The stamps of {topic} are on another clock than those of {leading.topic}: the recorder's times "
+                    "were used for it."
+                )
+                continue
+            self.stamps[topic] = stamps
+        return leading or ClockRelation("log")
+
+    def _joint_channels(
+        self,
+        topic: str,
+        signals: list[Signal],
+        blocks: list[cdr.JointStates],
+        relation: ClockRelation,
+        samples: dict[str, tuple[IntArray, npt.NDArray[Any]]],
+    ) -> None:
+        times = self.stamps.get(topic)
+        if times is None:
+            times = relation.apply(self._log_ns(topic))
+        scalar = signals[0].topic == _ENCODER_TOPIC
+        columns = [self._columns(topic, block, scalar) for block in blocks]
+        usable = [(block, column) for block, column in zip(blocks, columns, strict=True) if column is not None]
+        if not usable:
+            self._no_joints(topic, blocks, scalar)
+            return
+        skipped = sum(len(block.indices) for block, column in zip(blocks, columns, strict=True) if column is None)
+        if skipped:
+            self.warnings.append(f"{skipped} messages on {topic} are of other joints; they were left out.")
+        for signal in signals:
+            fields = [(block, column, getattr(block, _FIELDS[signal.field])) for block, column in usable]
+            missing = [field.shape[1] == 0 or bool(np.isnan(field[:, column]).all()) for _, column, field in fields]
+            if all(missing):
+                self.warnings.append(f"The messages on {topic} have no {signal.field}: there is no {signal.name}.")
+                continue
+            if any(field.shape[1] not in (0, len(block.names) or 1) for block, _, field in fields):
+                raise HannesError(f"The bag {self.path}: {topic} has another number of {signal.field}s than of names.")
+            present = [entry for entry in fields if entry[2].shape[1]]
+            indices = np.concatenate([block.indices for block, _, _ in present])
+            values = np.concatenate([field[:, column] for _, column, field in present])
+            order = np.argsort(indices, kind="stable")
+            values = values[order, 0] if scalar else values[order]
+            samples[signal.name] = (times[indices[order]], values)
+
+    def _columns(self, topic: str, block: cdr.JointStates, scalar: bool) -> list[int] | None:
+        """Columns of the joints that this topic is about; None if the block is of other joints."""
+        if not scalar:
+            return [block.names.index(n) for n in JOINT_NAMES] if set(JOINT_NAMES) <= set(block.names) else None
+        if ENCODER_JOINT in block.names:
+            return [block.names.index(ENCODER_JOINT)]
+        if len(block.names) <= 1 and block.position.shape[1] == 1:
+            name = block.names[0] if block.names else "(no name)"
+            note = f"The only joint on {topic} is called {name!r}; it was taken as {ENCODER_JOINT!r}."
+            if note not in self.warnings:
+                self.warnings.append(note)
+            return [0]
+        return None
+
+    def _no_joints(self, topic: str, blocks: list[cdr.JointStates], scalar: bool) -> None:
+        names = blocks[0].names
+        if scalar:
+            raise HannesError(
+                f"The bag {self.path}: {topic} has the joints {', '.join(names) or '(none)'}, but not "
+                f"{ENCODER_JOINT!r}; which one is the encoder cannot be told."
+            )
+        missing = [name for name in JOINT_NAMES if name not in names]
+        self.warnings.append(
+            f"The messages on {topic} lack the joints {', '.join(missing)}: there are no joint_positions."
+        )
+
+    def _in_order(
+        self, name: str, times: IntArray, values: npt.NDArray[Any]
+    ) -> tuple[IntArray, npt.NDArray[Any]]:
+        """Samples by time; a few swapped neighbours are sorted, a clock that starts again is an error."""
+        back = np.diff(times)
+        if (back >= 0).all():
+            return times, values
+        worst = int(np.argmin(back))
+        typical = float(np.median(np.abs(back)))
+        if -back[worst] > max(20.0 * typical, 50e6):
+            raise HannesError(
+                f"The bag {self.path}: the times of {name} go back at message {worst + 1}, from "
+                f"{times[worst] * 1e-9:.6f} s to {times[worst + 1] * 1e-9:.6f} s: more than one run is in the bag, or "
+                "the clock was set. Record each run into a bag of its own."
+            )
+        order = np.argsort(times, kind="stable")
+        self.warnings.append(f"{int((back < 0).sum())} samples of {name} came out of order; they were sorted by time.")
+        return times[order], values[order]
+
+    def _assemble(
+        self,
+        samples: dict[str, tuple[IntArray, npt.NDArray[Any]]],
+        chosen: dict[str, str],
+        relation: ClockRelation,
+        sha256: str,
+    ) -> Recording:
+        start = min(int(times[0]) for times, _ in samples.values())
+        stored = self.messages.metadata.get("start_ns")
+        if isinstance(stored, int) and not isinstance(stored, bool) and 0 <= start - stored < 10**15:
+            start = stored
+        channels = {
+            name: self._channel(name, (times - start) / 1e9, values) for name, (times, values) in samples.items()
+        }
+        for channel in channels.values():
+            self._look_at_units(channel)
+        metadata = {key: value for key, value in self.messages.metadata.items() if key not in RESERVED}
+        metadata["warnings"] = list(self.warnings)
+        metadata["bag"] = {
+            "storage": self.messages.bag.storage,
+            "files": [file.name for file in self.messages.bag.files],
+            "messages": sum(self.messages.counts.values()),
+            "topics": {name: chosen[SIGNALS[name].topic] for name in channels},
+        }
+        metadata["clock"] = {"kind": relation.kind, "offset": relation.offset_ns * 1e-9, "topic": relation.topic}
+        for sentence in self.warnings:
+            python_warnings.warn(f"{self.path}: {sentence}", RecordingWarning, stacklevel=4)
+        return Recording(channels, metadata, self.path, sha256, start)
+
+    def _channel(self, name: str, time: npt.NDArray[np.float64], values: npt.NDArray[Any]) -> Channel:
+        try:
+            return Channel(time, values, SIGNALS[name].unit, name)
+        except HannesError as error:
+            raise HannesError(f"The bag {self.path}: {error}") from None
+
+    def _look_at_units(self, channel: Channel) -> None:
+        if channel.name not in _PLAUSIBLE:
+            return
+        limit, guess = _PLAUSIBLE[channel.name]
+        if channel.name.endswith("_position"):
+            extent, what = float(np.ptp(channel.values)), "ranges over"
+        else:
+            extent, what = float(np.abs(channel.values).max()), "reaches"
+        if extent > limit:
+            self.warnings.append(
+                f"{channel.name} {what} {extent:.4g} {channel.unit}, which looks like {guess} rather than {channel.unit}."
+            )
+        elif channel.name.endswith("_position") and extent > _DEGREES:
+            self.warnings.append(
+                f"{channel.name} {what} {extent:.4g} {channel.unit}, which looks like degrees rather than "
+                f"{channel.unit} (a full closure is 14.57 rad)."
+            )
+
+
+class RecordingWarning(UserWarning):
+    """Something in a bag is suspicious; the same sentence is in the Recording's metadata."""
