@@ -1,9 +1,9 @@
 """CDR (XCDR1) of the few message types that carry signals, decoded and encoded by the column.
 
-A bag holds hundreds of thousands of equally built messages. They are decoded together: the layout of one message
-(where its arrays lie) is worked out, and all messages with the same structural bytes are read with it by numpy.
-Encoding mirrors it: rosbags' serialiser makes the first message, the numbers of the others are put into copies of it.
-Alignment padding is neither compared nor trusted: rclpy leaves it uninitialised.
+A bag holds hundreds of thousands of equally built messages. They are decoded together: the layout of one
+message (where its arrays lie) is worked out, and all messages with the same structural bytes are read with it
+by numpy. Encoding mirrors it: rosbags' serialiser makes the first message, the numbers of the others are put
+into copies of it. Alignment padding is neither compared nor trusted: rclpy leaves it uninitialised.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ def typestore() -> Typestore:
 
 
 def definition(msgtype: str) -> tuple[str, str]:
-    """Definition text (with all nested types) and RIHS01 hash of a type of ROS 2 Jazzy; KeyError if unknown."""
+    """Definition text (with all nested types) and RIHS01 hash of a type of ROS 2 Jazzy; KeyError if
+    unknown."""
     store = typestore()
     if msgtype not in store.fielddefs:
         raise KeyError(msgtype)
@@ -182,7 +183,8 @@ class _Cursor:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the parts of a JointState lie: byte ranges that make the structure, begin and count of each array."""
+    """Where the parts of a JointState lie: byte ranges that make the structure, begin and count of each
+    array."""
 
     endian: str
     names: tuple[str, ...]
@@ -279,7 +281,9 @@ def _multi_array(cursor: _Cursor) -> FloatArray:
         cursor.word()
     cursor.word()
     begin, count = cursor.numbers()
-    return np.frombuffer(cursor.data, dtype=cursor.endian + "f8", count=count, offset=begin).astype(np.float64)
+    return np.frombuffer(cursor.data, dtype=cursor.endian + "f8", count=count, offset=begin).astype(
+        np.float64
+    )
 
 
 def _each(raw: RawTopic, index: int, read: Any) -> Any:
@@ -312,11 +316,14 @@ def encode_joint_states(
     velocity: FloatArray | None = None,
     effort: FloatArray | None = None,
 ) -> list[bytes]:
-    """CDR of one sensor_msgs/JointState for each stamp (n,) in ns; fields (n, k) or None for an empty field."""
+    """CDR of one sensor_msgs/JointState for each stamp (n,) in ns; fields (n, k) or None for an empty
+    field."""
     store = typestore()
     header = store.types["std_msgs/msg/Header"]
     time = store.types["builtin_interfaces/msg/Time"]
-    fields = [np.zeros((len(stamps_ns), 0)) if values is None else values for values in (position, velocity, effort)]
+    fields = [
+        np.zeros((len(stamps_ns), 0)) if values is None else values for values in (position, velocity, effort)
+    ]
     first = store.types[JOINT_STATE](
         header=header(stamp=time(sec=0, nanosec=0), frame_id=""),
         name=list(names),
@@ -336,7 +343,10 @@ def encode_joint_states(
 def encode_strings(texts: Sequence[str]) -> list[bytes]:
     """CDR of one std_msgs/String for each text."""
     store = typestore()
-    return [bytes(store.serialize_cdr(store.types[STRING](data=str(text)), STRING, little_endian=True)) for text in texts]
+    return [
+        bytes(store.serialize_cdr(store.types[STRING](data=str(text)), STRING, little_endian=True))
+        for text in texts
+    ]
 
 
 def encode_multi_arrays(values: FloatArray) -> list[bytes]:

@@ -1,15 +1,16 @@
 """Bringing log times and header stamps onto one clock.
 
-A bag knows two times of a message: the log time, at which the recorder received it, and, for some types, the header
-stamp, at which it was measured. Messages without a header (the Float64 topics) have only the log time. If the recorder
-ran on the computer's clock while the stamps are simulated time (or another computer's clock), the two do not compare:
-the log times are then carried over onto the clock of the stamps.
+A bag knows two times of a message: the log time, at which the recorder received it, and, for some types, the
+header stamp, at which it was measured. Messages without a header (the Float64 topics) have only the log time.
+If the recorder ran on the computer's clock while the stamps are simulated time (or another computer's clock),
+the two do not compare: the log times are then carried over onto the clock of the stamps.
 
 - same      the stamps are within 0.1 s of the log times: log times are used as they are.
 - offset    the two run at one rate with a constant difference: the median difference is subtracted.
-- warped    they run at different rates (a simulation faster or slower than real time): log times are interpolated
-            between the pairs (log time, stamp) of the stamped topic. A header-less message then lies between the stamped
-            messages around it, so its time is right to one period of that topic and no better.
+- warped    they run at different rates (a simulation faster or slower than real time): log times are
+            interpolated between the pairs (log time, stamp) of the stamped topic. A header-less message then
+            lies between the stamped messages around it, so its time is right to one period of that topic and
+            no better.
 - log       nothing is stamped: everything is on the recorder's clock.
 """
 
@@ -63,8 +64,8 @@ class ClockRelation:
         """What was done, for the recording's warnings; "" if nothing had to be done."""
         if self.kind == "offset":
             return (
-                f"The stamps of {self.topic} and the recorder's times are on different clocks, {self.offset_ns * 1e-9:.3f} s "
-                "apart at the median: the times of messages without a header were shifted by that much."
+                f"The stamps of {self.topic} and the recorder's times are on different clocks, "
+                f"{self.offset_ns * 1e-9:.3f} s apart at the median: the times of messages without a header were shifted by that much."
             )
         if self.kind == "warped":
             return (

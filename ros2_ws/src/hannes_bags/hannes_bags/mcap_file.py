@@ -1,10 +1,11 @@
 """MCAP files: a writer whose chunk boundaries are the caller's, and a reader that never trusts a length.
 
-Format: https://mcap.dev/spec. The records that are rare (header, schemas, chunks, indexes, footer) are written by the
-official `mcap` package; messages are packed here because they are the hot path and because the official writer offers
-no way to end a chunk by time, which is what bounds the loss when the process is killed. The reader walks the file
-record by record and checks each length against what is there before touching it, so that memory and time are bounded
-by the size of the file and by `Limits`, whatever the bytes say.
+Format: https://mcap.dev/spec. The records that are rare (header, schemas, chunks, indexes, footer) are
+written by the official `mcap` package; messages are packed here because they are the hot path and because the
+official writer offers no way to end a chunk by time, which is what bounds the loss when the process is
+killed. The reader walks the file record by record and checks each length against what is there before
+touching it, so that memory and time are bounded by the size of the file and by `Limits`, whatever the bytes
+say.
 """
 
 from __future__ import annotations
@@ -34,15 +35,20 @@ _ZSTD_LEVEL = 3
 class McapWriter:
     """Writes an MCAP file of profile ros2 into a binary stream.
 
-    A chunk ends when it holds `chunk_bytes`, or when `end_chunk` is called; what was written before a chunk's end is
-    complete on its own, so a file cut anywhere keeps all earlier chunks. The same calls give the same bytes.
+    A chunk ends when it holds `chunk_bytes`, or when `end_chunk` is called; what was written before a chunk's
+    end is complete on its own, so a file cut anywhere keeps all earlier chunks. The same calls give the same
+    bytes.
     """
 
-    def __init__(self, stream: BinaryIO, *, chunk_bytes: int = 32 * 1024, compression: Compression = "none") -> None:
+    def __init__(
+        self, stream: BinaryIO, *, chunk_bytes: int = 32 * 1024, compression: Compression = "none"
+    ) -> None:
         self._stream = stream
         self._chunk_bytes = chunk_bytes
         self._compression = compression
-        self._compress = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress if compression == "zstd" else bytes
+        self._compress = (
+            zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress if compression == "zstd" else bytes
+        )
         self._offset = 0
         self._data_crc = 0
         self._schemas: list[records.Schema] = []
@@ -79,7 +85,11 @@ class McapWriter:
 
     def add_channel(self, topic: str, schema_id: int, metadata: dict[str, str]) -> int:
         channel = records.Channel(
-            id=len(self._channels) + 1, topic=topic, message_encoding="cdr", metadata=metadata, schema_id=schema_id
+            id=len(self._channels) + 1,
+            topic=topic,
+            message_encoding="cdr",
+            metadata=metadata,
+            schema_id=schema_id,
         )
         self._channels.append(channel)
         self._counts[channel.id] = 0
@@ -92,7 +102,12 @@ class McapWriter:
         self._counts[channel_id] = sequence
         self._index.setdefault(channel_id, []).append((log_ns, self._chunk_size))
         head = _MESSAGE_HEAD.pack(
-            Opcode.MESSAGE, _MESSAGE_BODY.size + len(data), channel_id, sequence & 0xFFFFFFFF, log_ns, publish_ns
+            Opcode.MESSAGE,
+            _MESSAGE_BODY.size + len(data),
+            channel_id,
+            sequence & 0xFFFFFFFF,
+            log_ns,
+            publish_ns,
         )
         self._append(head)
         self._append(bytes(data))
@@ -104,10 +119,13 @@ class McapWriter:
         record = records.Metadata(name=name, metadata=entries)
         offset = self._offset
         self._emit_record(record)
-        self._metadata_indexes.append(records.MetadataIndex(offset=offset, length=self._offset - offset, name=name))
+        self._metadata_indexes.append(
+            records.MetadataIndex(offset=offset, length=self._offset - offset, name=name)
+        )
 
     def end_chunk(self) -> None:
-        """End the chunk at hand, if it holds messages, and hand it to the stream (which the caller may then flush)."""
+        """End the chunk at hand, if it holds messages, and hand it to the stream (which the caller may then
+        flush)."""
         if not self._index:
             return
         raw = b"".join(self._chunk)
@@ -246,6 +264,8 @@ class Limits:
 
 @dataclass(frozen=True)
 class McapChannel:
+    """A channel of an MCAP file together with its schema."""
+
     topic: str
     type: str
     encoding: str
@@ -259,8 +279,8 @@ class McapScan:
     """One pass over an MCAP file; iterate `messages()`, then look at what was met.
 
     buffer    the whole file (an mmap will do)
-    tolerant  False: any damage raises McapDamage. True: damage is noted in `damage`, whole chunks after it are still
-              found, and only messages whose chunk passes its checksum are given.
+    tolerant  False: any damage raises McapDamage. True: damage is noted in `damage`, whole chunks after it
+              are still found, and only messages whose chunk passes its checksum are given.
     """
 
     buffer: memoryview
@@ -342,7 +362,9 @@ class McapScan:
             raise McapDamage(f"the messages unpack to more than {self.limits.total_bytes} bytes", begin)
         data = _decompress(buffer[position:end], name, unpacked, begin)
         if len(data) != unpacked:
-            raise McapDamage(f"a chunk unpacks to {len(data)} bytes, not to the {unpacked} that it says", begin)
+            raise McapDamage(
+                f"a chunk unpacks to {len(data)} bytes, not to the {unpacked} that it says", begin
+            )
         if crc and zlib.crc32(data) != crc:
             raise McapDamage("a chunk fails its checksum", begin)
         yield from self._chunk_messages(data, begin)
@@ -410,10 +432,14 @@ class McapScan:
             topic, position = _string(data, begin + 4, end)
             encoding, position = _string(data, position, end)
             name, schema_encoding, text = self._schemas.get(schema_id, ("", "", b""))
-            channel = McapChannel(topic, name, encoding, schema_encoding, text, _string_map(data, position, end))
+            channel = McapChannel(
+                topic, name, encoding, schema_encoding, text, _string_map(data, position, end)
+            )
             known = self.channels.setdefault(identity, channel)
             if known != channel:
-                raise McapDamage(f"channel {identity} is defined twice, as {known.topic} and as {topic}", begin)
+                raise McapDamage(
+                    f"channel {identity} is defined twice, as {known.topic} and as {topic}", begin
+                )
 
     def _check_data_crc(self, begin: int, end: int, position: int) -> None:
         if end - begin < 4:
@@ -433,14 +459,16 @@ class McapScan:
                 raise McapDamage("the summary fails its checksum", begin)
         if self.declared_count is not None and self.declared_count != self.message_count:
             raise McapDamage(
-                f"the summary tells of {self.declared_count} messages, but {self.message_count} are there", begin
+                f"the summary tells of {self.declared_count} messages, but {self.message_count} are there",
+                begin,
             )
         self.complete = True
         self.salvaged_bytes = end + 8
 
 
 def _record(buffer: memoryview, position: int, size: int) -> tuple[int, int, int]:
-    """Opcode, begin and end of the record at `position`; raises McapDamage if it does not fit into the file."""
+    """Opcode, begin and end of the record at `position`; raises McapDamage if it does not fit into the
+    file."""
     if position + 9 > size:
         raise McapDamage("the file is cut within a record", position)
     opcode, length = _RECORD_HEAD.unpack_from(buffer, position)
@@ -453,7 +481,8 @@ def _record(buffer: memoryview, position: int, size: int) -> tuple[int, int, int
 
 
 def _next_chunk(buffer: memoryview, position: int) -> int | None:
-    """Where the next plausible chunk begins (kind, a length that fits, ordered times, a known compression)."""
+    """Where the next plausible chunk begins (kind, a length that fits, ordered times, a known
+    compression)."""
     size = len(buffer)
     step = 1 << 20
     while position < size:
@@ -508,7 +537,8 @@ def _string_map(data: memoryview, position: int, end: int) -> dict[str, str]:
 
 
 def _decompress(data: memoryview, name: str, size: int, origin: int) -> memoryview:
-    """Unpack at most `size` + 1 bytes, so that a bomb shows as a wrong length instead of filling the memory."""
+    """Unpack at most `size` + 1 bytes, so that a bomb shows as a wrong length instead of filling the
+    memory."""
     if name == "":
         return data
     try:

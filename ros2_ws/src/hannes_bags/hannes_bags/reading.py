@@ -1,9 +1,9 @@
 """Bag -> Recording.
 
-Topics are recognised by their canonical name under any namespace, joints by their name, types exactly. JointState
-messages count at their header stamp, header-less ones at their log time; `clocks` says what happens if those are two
-clocks. What is wrong with the file or the data is one HannesError; what is merely suspicious is a sentence in
-`metadata["warnings"]`.
+Topics are recognised by their canonical name under any namespace, joints by their name, types exactly.
+JointState messages count at their header stamp, header-less ones at their log time; `clocks` says what
+happens if those are two clocks. What is wrong with the file or the data is one HannesError; what is merely
+suspicious is a sentence in `metadata["warnings"]`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
 from hannes_description.errors import HannesError
 from hannes_description.joints import ENCODER_JOINT, JOINT_NAMES
 from hannes_description.signals import SIGNALS, Signal
@@ -97,12 +96,12 @@ def read_bag(
 ) -> Recording:
     """Read a rosbag2 bag (folder, .mcap or .db3 file) into a Recording.
 
-    topics  by signal name (or canonical topic), the topic that carries it where the name says it differently, or where
-            two topics might be meant; None leaves the signal out
+    topics  by signal name (or canonical topic), the topic that carries it where the name says it differently,
+            or where two topics might be meant; None leaves the signal out
     limits  how much is read at most; by default 6 million messages and 1 GiB
 
-    Raises HannesError: unreadable or damaged bag, ambiguous or missing topic, wrong type, undecodable message, NaN,
-    stamps that go back.
+    Raises HannesError: unreadable or damaged bag, ambiguous or missing topic, wrong type, undecodable
+    message, NaN, stamps that go back.
     """
     bag = locate(path)
     messages = BagMessages(bag, limits or Limits())
@@ -130,7 +129,9 @@ def _overrides(topics: Mapping[str, str | None]) -> dict[str, str | None]:
             raise HannesError(f"topics: unknown signal {key!r}. Known signals: {', '.join(SIGNALS)}.")
         name = None if topic is None else "/" + topic.strip("/")
         if resolved.get(canonical, name) != name:
-            raise HannesError(f"topics: two topics are named for {canonical}: {resolved[canonical]} and {name}.")
+            raise HannesError(
+                f"topics: two topics are named for {canonical}: {resolved[canonical]} and {name}."
+            )
         resolved[canonical] = name
     return resolved
 
@@ -166,7 +167,11 @@ class _Reader:
                 f"The bag {self.path} has none of the topics {wanted}, under any namespace. It has: {present}. "
                 "Name the topics with topics={signal: topic}."
             )
-        states = {topic: self._decode(topic, cdr.decode_joint_states) for topic in chosen.values() if self._is(topic)}
+        states = {
+            topic: self._decode(topic, cdr.decode_joint_states)
+            for topic in chosen.values()
+            if self._is(topic)
+        }
         relation = self._relation(states)
         samples: dict[str, tuple[IntArray, npt.NDArray[Any]]] = {}
         for canonical, topic in chosen.items():
@@ -191,11 +196,15 @@ class _Reader:
                     continue
                 if named not in self.raw:
                     present = ", ".join(self.messages.types)
-                    raise HannesError(f"The bag {self.path} has no message on {named}. Its topics: {present}.")
+                    raise HannesError(
+                        f"The bag {self.path} has no message on {named}. Its topics: {present}."
+                    )
                 chosen[canonical] = named
                 continue
             taken = set(self.overrides.values())
-            candidates = sorted(topic for topic in self.raw if _canonical_of(topic) == canonical and topic not in taken)
+            candidates = sorted(
+                topic for topic in self.raw if _canonical_of(topic) == canonical and topic not in taken
+            )
             if len(candidates) > 1:
                 raise HannesError(
                     f"The bag {self.path} has several topics that may be {canonical}: {', '.join(candidates)}. "
@@ -279,21 +288,31 @@ class _Reader:
             times = relation.apply(self._log_ns(topic))
         scalar = signals[0].topic == _ENCODER_TOPIC
         columns = [self._columns(topic, block, scalar) for block in blocks]
-        usable = [(block, column) for block, column in zip(blocks, columns, strict=True) if column is not None]
+        usable = [
+            (block, column) for block, column in zip(blocks, columns, strict=True) if column is not None
+        ]
         if not usable:
             self._no_joints(topic, blocks, scalar)
             return
-        skipped = sum(len(block.indices) for block, column in zip(blocks, columns, strict=True) if column is None)
+        skipped = sum(
+            len(block.indices) for block, column in zip(blocks, columns, strict=True) if column is None
+        )
         if skipped:
             self.warnings.append(f"{skipped} messages on {topic} are of other joints; they were left out.")
         for signal in signals:
             fields = [(block, column, getattr(block, _FIELDS[signal.field])) for block, column in usable]
-            missing = [field.shape[1] == 0 or bool(np.isnan(field[:, column]).all()) for _, column, field in fields]
+            missing = [
+                field.shape[1] == 0 or bool(np.isnan(field[:, column]).all()) for _, column, field in fields
+            ]
             if all(missing):
-                self.warnings.append(f"The messages on {topic} have no {signal.field}: there is no {signal.name}.")
+                self.warnings.append(
+                    f"The messages on {topic} have no {signal.field}: there is no {signal.name}."
+                )
                 continue
             if any(field.shape[1] not in (0, len(block.names) or 1) for block, _, field in fields):
-                raise HannesError(f"The bag {self.path}: {topic} has another number of {signal.field}s than of names.")
+                raise HannesError(
+                    f"The bag {self.path}: {topic} has another number of {signal.field}s than of names."
+                )
             present = [entry for entry in fields if entry[2].shape[1]]
             indices = np.concatenate([block.indices for block, _, _ in present])
             values = np.concatenate([field[:, column] for _, column, field in present])
@@ -304,7 +323,9 @@ class _Reader:
     def _columns(self, topic: str, block: cdr.JointStates, scalar: bool) -> list[int] | None:
         """Columns of the joints that this topic is about; None if the block is of other joints."""
         if not scalar:
-            return [block.names.index(n) for n in JOINT_NAMES] if set(JOINT_NAMES) <= set(block.names) else None
+            return (
+                [block.names.index(n) for n in JOINT_NAMES] if set(JOINT_NAMES) <= set(block.names) else None
+            )
         if ENCODER_JOINT in block.names:
             return [block.names.index(ENCODER_JOINT)]
         if len(block.names) <= 1 and block.position.shape[1] == 1:
@@ -343,7 +364,9 @@ class _Reader:
                 "the clock was set. Record each run into a bag of its own."
             )
         order = np.argsort(times, kind="stable")
-        self.warnings.append(f"{int((back < 0).sum())} samples of {name} came out of order; they were sorted by time.")
+        self.warnings.append(
+            f"{int((back < 0).sum())} samples of {name} came out of order; they were sorted by time."
+        )
         return times[order], values[order]
 
     def _assemble(
@@ -358,7 +381,8 @@ class _Reader:
         if isinstance(stored, int) and not isinstance(stored, bool) and 0 <= start - stored < 10**15:
             start = stored
         channels = {
-            name: self._channel(name, (times - start) / 1e9, values) for name, (times, values) in samples.items()
+            name: self._channel(name, (times - start) / 1e9, values)
+            for name, (times, values) in samples.items()
         }
         for channel in channels.values():
             self._look_at_units(channel)
@@ -370,7 +394,11 @@ class _Reader:
             "messages": sum(self.messages.counts.values()),
             "topics": {name: chosen[SIGNALS[name].topic] for name in channels},
         }
-        metadata["clock"] = {"kind": relation.kind, "offset": relation.offset_ns * 1e-9, "topic": relation.topic}
+        metadata["clock"] = {
+            "kind": relation.kind,
+            "offset": relation.offset_ns * 1e-9,
+            "topic": relation.topic,
+        }
         for sentence in self.warnings:
             python_warnings.warn(f"{self.path}: {sentence}", RecordingWarning, stacklevel=4)
         return Recording(channels, metadata, self.path, sha256, start)
@@ -391,7 +419,8 @@ class _Reader:
             extent, what = float(np.abs(channel.values).max()), "reaches"
         if extent > limit:
             self.warnings.append(
-                f"{channel.name} {what} {extent:.4g} {channel.unit}, which looks like {guess} rather than {channel.unit}."
+                f"{channel.name} {what} {extent:.4g} {channel.unit}, which looks like {guess} "
+                f"rather than {channel.unit}."
             )
         elif channel.name.endswith("_position") and extent > _DEGREES:
             self.warnings.append(

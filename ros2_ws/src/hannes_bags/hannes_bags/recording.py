@@ -1,7 +1,8 @@
 """A recording: named, timed, checked signals, independent of where they came from.
 
-`Recording` is what every tool of the lab works on, whether it was read from a bag (`reading.read_bag`) or made from a
-rollout. Times are in s since the recording's start, values in the SI unit of `hannes_description.signals.SIGNALS`.
+`Recording` is what every tool of the lab works on, whether it was read from a bag (`reading.read_bag`) or
+made from a rollout. Times are in s since the recording's start, values in the SI unit of
+`hannes_description.signals.SIGNALS`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-
 from hannes_description.errors import HannesError
 from hannes_description.joints import JOINT_NAMES
 from hannes_description.signals import SIGNALS
@@ -35,8 +35,8 @@ class Channel:
     """One signal over time; the arrays are read-only copies.
 
     time    (n,) float64, s since the recording's start, finite, never decreasing; n >= 1
-    values  (n,) float64, or (n, 13) for joint_positions and joint_velocities (ordered by JOINT_NAMES), (n, k) for
-            stiffness_probability, (n,) text for stiffness_label; finite, in `unit`
+    values  (n,) float64, or (n, 13) for joint_positions and joint_velocities (ordered by JOINT_NAMES), (n, k)
+            for stiffness_probability, (n,) text for stiffness_label; finite, in `unit`
     unit    the unit of SIGNALS[name]
     name    canonical signal name
 
@@ -64,7 +64,9 @@ class Channel:
         values = self._checked_values(time.size)
         bad = np.flatnonzero(~np.isfinite(time))
         if bad.size:
-            raise HannesError(f"Channel {self.name!r}: time is {time[bad[0]]} at index {bad[0]}; it must be finite.")
+            raise HannesError(
+                f"Channel {self.name!r}: time is {time[bad[0]]} at index {bad[0]}; it must be finite."
+            )
         back = np.flatnonzero(np.diff(time) < 0.0)
         if back.size:
             k = int(back[0]) + 1
@@ -123,10 +125,12 @@ class Recording:
     """A set of channels on one clock, with what is known of them.
 
     channels  by canonical signal name
-    metadata  JSON-like; what the bag says of itself (condition, object, closures, seed ...) and, from `read_bag`,
-              "warnings" (list of sentences), "bag" (storage, topics) and "clock" (how the times were aligned)
+    metadata  JSON-like; what the bag says of itself (condition, object, closures, seed ...) and, from
+              `read_bag`, "warnings" (list of sentences), "bag" (storage, topics) and "clock" (how the times
+              were aligned)
     source    path that it was read from, or what made it
-    sha256    of the bag's storage files (equals `sha256sum` for a bag of one file); of the content if not from a bag
+    sha256    of the bag's storage files (equals `sha256sum` for a bag of one file); of the content if not
+              from a bag
     start_ns  time 0 of the channels on the recording's own clock, ns
     """
 
@@ -180,7 +184,8 @@ class Recording:
         return tuple(self.metadata.get("warnings", ()))
 
     def require(self, names: Iterable[str]) -> None:
-        """Raise one HannesError that lists every missing signal of `names` and the signals that are present."""
+        """Raise one HannesError that lists every missing signal of `names` and the signals that are
+        present."""
         wanted = list(names)
         unknown = [name for name in wanted if name not in SIGNALS]
         if unknown:
@@ -197,12 +202,15 @@ class Recording:
             )
 
     def slice(self, t0: float, t1: float) -> Recording:
-        """The samples with t0 <= time < t1, with t0 as the new time 0; channels without a sample there are left out.
+        """The samples with t0 <= time < t1, with t0 as the new time 0; channels without a sample there are
+        left out.
 
         Raises HannesError if t0 >= t1 or if nothing lies between.
         """
         if not t0 < t1:
-            raise HannesError(f"Cannot cut the recording {self.source} from {t0} s to {t1} s: the start must be earlier.")
+            raise HannesError(
+                f"Cannot cut the recording {self.source} from {t0} s to {t1} s: the start must be earlier."
+            )
         channels: dict[str, Channel] = {}
         for name, channel in self.channels.items():
             i, j = np.searchsorted(channel.time, [t0, t1], side="left")
@@ -219,8 +227,8 @@ class Recording:
         """Values of a channel at `times` (m,), shape (m,) or (m, k).
 
         method  "linear" between samples; "previous" holds the last sample (commands, classes); "nearest"
-        At most one sample period before the first or after the last sample the edge value is held; beyond that the
-        channel says nothing and a HannesError is raised. Text channels take "previous" or "nearest".
+        At most one sample period before the first or after the last sample the edge value is held; beyond
+        that the channel says nothing and a HannesError is raised. Text channels take "previous" or "nearest".
         """
         channel = self[name]
         at = np.asarray(times, dtype=np.float64)
@@ -232,7 +240,9 @@ class Recording:
             )
         if method == "linear":
             if name in _TEXT_SIGNALS:
-                raise HannesError(f"Channel {name!r} is text: resample it with method 'previous' or 'nearest'.")
+                raise HannesError(
+                    f"Channel {name!r} is text: resample it with method 'previous' or 'nearest'."
+                )
             if channel.values.ndim == 1:
                 return np.interp(at, channel.time, channel.values)
             columns = [np.interp(at, channel.time, column) for column in channel.values.T]
@@ -267,8 +277,11 @@ class Recording:
         return digest.hexdigest()
 
     def differences(self, other: Recording) -> list[str]:
-        """How the channels of `other` differ from these, as sentences; empty if times and values are equal exactly."""
-        found = [f"{name} is only in one of the two." for name in sorted(set(self.channels) ^ set(other.channels))]
+        """How the channels of `other` differ from these, as sentences; empty if times and values are equal
+        exactly."""
+        found = [
+            f"{name} is only in one of the two." for name in sorted(set(self.channels) ^ set(other.channels))
+        ]
         if self.start_ns != other.start_ns:
             found.append(f"start_ns is {self.start_ns} and {other.start_ns}.")
         for name in self.channels:
@@ -280,8 +293,12 @@ class Recording:
                 continue
             if not np.array_equal(mine.time, theirs.time):
                 k = int(np.flatnonzero(mine.time != theirs.time)[0])
-                found.append(f"{name}: time differs first at index {k}: {mine.time[k]!r} and {theirs.time[k]!r}.")
+                found.append(
+                    f"{name}: time differs first at index {k}: {mine.time[k]!r} and {theirs.time[k]!r}."
+                )
             if not np.array_equal(mine.values, theirs.values):
                 k = int(np.argwhere(mine.values != theirs.values)[0][0])
-                found.append(f"{name}: values differ first at index {k}: {mine.values[k]!r} and {theirs.values[k]!r}.")
+                found.append(
+                    f"{name}: values differ first at index {k}: {mine.values[k]!r} and {theirs.values[k]!r}."
+                )
         return found

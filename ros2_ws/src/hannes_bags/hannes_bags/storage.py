@@ -1,9 +1,10 @@
 """What lies on disk: the files of a bag, its metadata.yaml, and its raw messages, read within bounds.
 
-rosbag2 bags are a folder with metadata.yaml and storage files (MCAP or SQLite), or a single storage file. Nothing here
-decodes a message. Every failure is a HannesError that says which file, what is wrong and what to do. The files are
-read here rather than by rosbags because rosbags allocates by the lengths that it finds, executes code that it makes
-from the definitions in the bag, and loads YAML with a parser that overflows the stack on deep nesting.
+rosbag2 bags are a folder with metadata.yaml and storage files (MCAP or SQLite), or a single storage file.
+Nothing here decodes a message. Every failure is a HannesError that says which file, what is wrong and what to
+do. The files are read here rather than by rosbags because rosbags allocates by the lengths that it finds,
+executes code that it makes from the definitions in the bag, and loads YAML with a parser that overflows the
+stack on deep nesting.
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ from urllib.parse import quote
 
 import yaml
 import zstandard
-
 from hannes_description.errors import HannesError
 
 from .mcap_file import Limits, McapDamage, McapScan
@@ -39,7 +39,8 @@ _SQLITE_STEPS_LEAST = 20_000_000
 
 @dataclass(frozen=True)
 class TopicEntry:
-    """A topic of a bag: type, number of messages, type hash and the publishers' QoS (both empty if not known)."""
+    """A topic of a bag: type, number of messages, type hash and the publishers' QoS (both empty if not
+    known)."""
 
     name: str
     type: str
@@ -80,6 +81,7 @@ class BagFiles:
 
 
 def recover_hint(path: Path) -> str:
+    """What to do about a bag that is not whole."""
     return _RECOVER.format(path)
 
 
@@ -118,19 +120,23 @@ def _locate_folder(path: Path) -> BagFiles:
     _inside(path, METADATA_FILE, metadata_path)
     information = load_metadata(metadata_path)
     storage = information.get("storage_identifier")
-    if storage not in _STORAGE.values():
+    if not isinstance(storage, str) or storage not in _STORAGE.values():
         raise HannesError(
             f"{metadata_path}: storage_identifier is {storage!r}; readable storages: {', '.join(_STORAGE.values())}."
         )
     names = information.get("relative_file_paths")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-        raise HannesError(f"{metadata_path}: relative_file_paths must list the bag's files, but is {names!r}.")
+        raise HannesError(
+            f"{metadata_path}: relative_file_paths must list the bag's files, but is {names!r}."
+        )
     version = information.get("version")
     files: list[Path] = []
     for name in names:
         pure = PurePosixPath(name)
         if pure.is_absolute() or ".." in pure.parts or "\0" in name:
-            raise HannesError(f"{metadata_path}: the file {name!r} lies outside the bag's folder; it is not read.")
+            raise HannesError(
+                f"{metadata_path}: the file {name!r} lies outside the bag's folder; it is not read."
+            )
         # Before version 4 the paths were relative to the folder that holds the bag's folder.
         relative = pure.name if isinstance(version, int) and version < 4 else name
         file = path / relative
@@ -141,7 +147,9 @@ def _locate_folder(path: Path) -> BagFiles:
         files.append(file)
     bag = BagFiles(path, tuple(files), storage, information)
     if bag.compression not in ("", "file", "message"):
-        raise HannesError(f"{metadata_path}: compression_mode is {bag.compression!r}; readable: none, file, message.")
+        raise HannesError(
+            f"{metadata_path}: compression_mode is {bag.compression!r}; readable: none, file, message."
+        )
     if bag.compression and information.get("compression_format") != "zstd":
         raise HannesError(
             f"{metadata_path}: compression_format is {information.get('compression_format')!r}; readable: zstd."
@@ -153,7 +161,9 @@ def _inside(folder: Path, name: str, file: Path) -> None:
     if not file.exists():
         raise HannesError(f"The bag {folder} lacks its file {name!r}, which its {METADATA_FILE} names.")
     if not file.resolve().is_relative_to(folder.resolve()):
-        raise HannesError(f"The bag {folder}: {name!r} is a link that leads out of the bag's folder; it is not read.")
+        raise HannesError(
+            f"The bag {folder}: {name!r} is a link that leads out of the bag's folder; it is not read."
+        )
     if not stat.S_ISREG(file.stat().st_mode):
         raise HannesError(f"The bag {folder}: {name!r} is not a file.")
 
@@ -161,7 +171,9 @@ def _inside(folder: Path, name: str, file: Path) -> None:
 def _refuse_wal(file: Path) -> None:
     wal = file.with_name(file.name + "-wal")
     if file.suffix == ".db3" and wal.exists() and wal.stat().st_size > 0:
-        raise HannesError(f"{file} was not closed (its log {wal.name} is still there). {recover_hint(file.parent)}")
+        raise HannesError(
+            f"{file} was not closed (its log {wal.name} is still there). {recover_hint(file.parent)}"
+        )
 
 
 def load_metadata(path: Path) -> dict[str, Any]:
@@ -171,9 +183,19 @@ def load_metadata(path: Path) -> dict[str, Any]:
         raise HannesError(f"{path} has {size} bytes; more than {_METADATA_BYTES} are not read.")
     try:
         # The C loader of libyaml overflows the stack on deep nesting; this one raises RecursionError.
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)  # noqa: S506
-    except (yaml.YAMLError, ValueError, RecursionError, OverflowError, TypeError, AttributeError, LookupError) as error:
-        reason = "it is nested too deeply" if isinstance(error, RecursionError) else str(error).replace("\n", " ")
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    except (
+        yaml.YAMLError,
+        ValueError,
+        RecursionError,
+        OverflowError,
+        TypeError,
+        AttributeError,
+        LookupError,
+    ) as error:
+        reason = (
+            "it is nested too deeply" if isinstance(error, RecursionError) else str(error).replace("\n", " ")
+        )
         raise HannesError(f"{path} is not readable YAML: {reason} {recover_hint(path.parent)}") from None
     information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
     if not isinstance(information, dict):
@@ -214,7 +236,8 @@ def encode_entries(metadata: Mapping[str, Any], reserved: Collection[str] = ()) 
 
 @dataclass
 class BagMessages:
-    """One pass over the raw messages of a bag, file by file; what it tells of the bag is complete after the pass.
+    """One pass over the raw messages of a bag, file by file; what it tells of the bag is complete after the
+    pass.
 
     topics     by name, filled as they are met
     metadata   the recording's own metadata
@@ -243,7 +266,13 @@ class BagMessages:
     def entries(self) -> tuple[TopicEntry, ...]:
         """The topics met so far, by name."""
         return tuple(
-            TopicEntry(name, self.types[name], self.counts.get(name, 0), self.hashes.get(name, ""), self.qos.get(name, ""))
+            TopicEntry(
+                name,
+                self.types[name],
+                self.counts.get(name, 0),
+                self.hashes.get(name, ""),
+                self.qos.get(name, ""),
+            )
             for name in sorted(self.types)
         )
 
@@ -288,7 +317,9 @@ class BagMessages:
 
     def _sqlite(self, path: Path) -> Iterator[tuple[str, int, bytes | memoryview]]:
         if self.bag.compression == "file":
-            raise HannesError(f"{path}: decompress it first (`zstd -d`): a packed SQLite file cannot be read in place.")
+            raise HannesError(
+                f"{path}: decompress it first (`zstd -d`): a packed SQLite file cannot be read in place."
+            )
         try:
             with open_sqlite(path, f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1") as connection:
                 topics: dict[int, str] = {}
@@ -356,7 +387,9 @@ def open_sqlite(path: Path, uri: str) -> Iterator[sqlite3.Connection]:
 
 def _refuse_views(connection: sqlite3.Connection) -> None:
     """A view in place of a table could compute for ever or make rows from nothing."""
-    kinds = dict(connection.execute("SELECT name, type FROM sqlite_master WHERE name IN ('messages', 'topics')"))
+    kinds = dict(
+        connection.execute("SELECT name, type FROM sqlite_master WHERE name IN ('messages', 'topics')")
+    )
     for name in ("messages", "topics"):
         if kinds.get(name) != "table":
             raise sqlite3.DatabaseError(f"it has no table {name!r}, so it is not a rosbag2 file")
@@ -367,7 +400,9 @@ def sqlite_topics(connection: sqlite3.Connection) -> list[tuple[int, str, str, s
     columns = {row[1] for row in connection.execute("PRAGMA table_info(topics)")}
     qos = "offered_qos_profiles" if "offered_qos_profiles" in columns else "''"
     type_hash = "type_description_hash" if "type_description_hash" in columns else "''"
-    rows = connection.execute(f"SELECT id, name, type, serialization_format, {qos}, {type_hash} FROM topics").fetchall()
+    rows = connection.execute(
+        f"SELECT id, name, type, serialization_format, {qos}, {type_hash} FROM topics"
+    ).fetchall()
     for row in rows:
         if not isinstance(row[0], int) or not all(isinstance(text, str) for text in row[1:]):
             raise sqlite3.DatabaseError("a row of its topics is not a topic")
@@ -385,7 +420,9 @@ def _mapped(path: Path, packed: bool, limits: Limits) -> Iterator[memoryview]:
             except zstandard.ZstdError as error:
                 raise HannesError(f"{path} is damaged: it cannot be unpacked ({error}).") from None
             if len(plain) > limits.chunk_bytes:
-                raise HannesError(f"{path} unpacks to more than {limits.chunk_bytes} bytes: unpack it first (`zstd -d`).")
+                raise HannesError(
+                    f"{path} unpacks to more than {limits.chunk_bytes} bytes: unpack it first (`zstd -d`)."
+                )
             yield memoryview(plain)
             return
         if path.stat().st_size == 0:

@@ -1,8 +1,8 @@
 """Messages -> bag: a writer that a kill cannot rob of more than its last chunk, and Recording -> bag.
 
 A bag is a folder `NAME/` with `NAME_0.mcap` and, once it is closed, `metadata.yaml` (rosbag2 version 9), as
-`ros2 bag` makes and reads it: definitions embedded, RIHS01 type hashes, QoS, the recording's metadata as custom_data
-and as an MCAP metadata record at the file's beginning (so that it survives a kill).
+`ros2 bag` makes and reads it: definitions embedded, RIHS01 type hashes, QoS, the recording's metadata as
+custom_data and as an MCAP metadata record at the file's beginning (so that it survives a kill).
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 import yaml
-
 from hannes_description.errors import HannesError
 from hannes_description.joints import ENCODER_JOINT, JOINT_NAMES
 from hannes_description.signals import NAMESPACE, SIGNALS
@@ -69,7 +68,8 @@ class BagWriter:
 
     path         the bag's folder, which must not exist yet
     metadata     JSON-like; kept in the bag
-    chunk_bytes  a chunk is handed over when it is this long, or at `flush`; what `flush` has handed over survives a kill
+    chunk_bytes  a chunk is handed over when it is this long, or at `flush`; what `flush` has handed over
+                 survives a kill
     compression  "none" (default; the bytes do not depend on a compressor's version) or "zstd" (about a third)
 
     The same calls make the same bytes. Raises HannesError if the folder exists or cannot be written.
@@ -122,7 +122,8 @@ class BagWriter:
     ) -> None:
         """Announce a topic before its first message.
 
-        definition  (encoding, text) for a type that ROS 2 Jazzy's common interfaces do not have, with its type_hash
+        definition  (encoding, text) for a type that ROS 2 Jazzy's common interfaces do not have, with its
+                    type_hash
         """
         if name in self._topics:
             raise HannesError(f"Topic {name} was added to the bag {self.path} already.")
@@ -130,7 +131,9 @@ class BagWriter:
             try:
                 text, known_hash = cdr.definition(msgtype)
             except KeyError:
-                raise HannesError(f"The definition of the message type {msgtype!r} of {name} is not known.") from None
+                raise HannesError(
+                    f"The definition of the message type {msgtype!r} of {name} is not known."
+                ) from None
             definition, type_hash = ("ros2msg", text.encode()), known_hash if type_hash is None else type_hash
         offered = qos or Qos()
         if msgtype not in self._schemas:
@@ -168,7 +171,9 @@ class BagWriter:
         try:
             self._mcap.end_chunk()
             information = self._information()
-            text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False, allow_unicode=True)
+            text = yaml.safe_dump(
+                {"rosbag2_bagfile_information": information}, sort_keys=False, allow_unicode=True
+            )
             # Without the file's own name, so that a bag has the same bytes under any name.
             nameless = {**information, "relative_file_paths": [], "files": []}
             serialised = yaml.safe_dump(nameless, sort_keys=False, allow_unicode=True)
@@ -211,7 +216,12 @@ class BagWriter:
             "compression_format": "",
             "compression_mode": "",
             "relative_file_paths": [self._file.name],
-            "files": [{"path": self._file.name, **{key: dict(v) if isinstance(v, dict) else v for key, v in span.items()}}],
+            "files": [
+                {
+                    "path": self._file.name,
+                    **{key: dict(v) if isinstance(v, dict) else v for key, v in span.items()},
+                }
+            ],
             "custom_data": self._custom,
             "ros_distro": "jazzy",
         }
@@ -232,14 +242,16 @@ def write_recording(
 ) -> Path:
     """Write a Recording as a bag with the topics of the node graph; gives back the bag's folder.
 
-    Stamps and log times are start_ns + time, rounded to ns; numbers are exact. `read_bag` gives the same channels,
-    metadata and start_ns. The same recording makes the same bytes. Signals of one JointState topic (encoder_position,
-    encoder_velocity, motor_effort; joint_positions, joint_velocities) must share their times, and the position must be
-    there. Raises HannesError otherwise, or if `path` exists.
+    Stamps and log times are start_ns + time, rounded to ns; numbers are exact. `read_bag` gives the same
+    channels, metadata and start_ns. The same recording makes the same bytes. Signals of one JointState topic
+    (encoder_position, encoder_velocity, motor_effort; joint_positions, joint_velocities) must share their
+    times, and the position must be there. Raises HannesError otherwise, or if `path` exists.
     """
     prefix = "/" + namespace.strip("/") if namespace.strip("/") else ""
     if recording.start_ns < 0:
-        raise HannesError(f"The recording {recording.source} starts at {recording.start_ns} ns; a bag's times are >= 0.")
+        raise HannesError(
+            f"The recording {recording.source} starts at {recording.start_ns} ns; a bag's times are >= 0."
+        )
     streams = list(_streams(recording))
     with BagWriter(
         path, {**recording.metadata, "start_ns": recording.start_ns}, compression=compression
@@ -260,14 +272,18 @@ def _streams(recording: Recording) -> Iterator[tuple[str, str, npt.NDArray[np.in
     """(canonical topic, type, stamps ns, messages) for each topic, in the order of SIGNALS."""
     done: set[str] = set()
     for signal in SIGNALS.values():
-        present = [s.name for s in SIGNALS.values() if s.topic == signal.topic and s.name in recording.channels]
+        present = [
+            s.name for s in SIGNALS.values() if s.topic == signal.topic and s.name in recording.channels
+        ]
         if signal.topic in done or not present:
             continue
         done.add(signal.topic)
         channels = [recording.channels[name] for name in present]
         stamps = np.rint(channels[0].time * 1e9).astype(np.int64) + recording.start_ns
         if stamps[0] < 0:
-            raise HannesError(f"{present[0]} of {recording.source} begins before time 0; a bag's times are >= 0.")
+            raise HannesError(
+                f"{present[0]} of {recording.source} begins before time 0; a bag's times are >= 0."
+            )
         if signal.type == cdr.JOINT_STATE:
             yield signal.topic, signal.type, stamps, _joint_states(signal.topic, channels, stamps)
         elif signal.type == cdr.STRING:
@@ -288,6 +304,10 @@ def _joint_states(topic: str, channels: list[Channel], stamps: npt.NDArray[np.in
             )
         fields[SIGNALS[channel.name].field] = channel.values.reshape(len(stamps), -1)
     if "position" not in fields:
-        raise HannesError(f"{channels[0].name} cannot be written without the position that shares its topic {topic}.")
+        raise HannesError(
+            f"{channels[0].name} cannot be written without the position that shares its topic {topic}."
+        )
     names = [ENCODER_JOINT] if fields["position"].shape[1] == 1 else list(JOINT_NAMES)
-    return cdr.encode_joint_states(stamps, names, fields["position"], fields.get("velocity"), fields.get("effort"))
+    return cdr.encode_joint_states(
+        stamps, names, fields["position"], fields.get("velocity"), fields.get("effort")
+    )
