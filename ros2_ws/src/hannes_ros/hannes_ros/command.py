@@ -1,0 +1,48 @@
+"""What stands between a command from the graph and the motor: finite, within limits, recent."""
+
+from __future__ import annotations
+
+import math
+
+
+class CommandGate:
+    """Lets a voltage through only if it is finite and recent, and clamps it.
+
+    limit    V, the command is clamped to [-limit, limit]
+    timeout  s after the last command, by the caller's clock, from which the output is 0 V
+    rejected, clamped, timeouts  counts
+    """
+
+    def __init__(self, limit: float, timeout: float) -> None:
+        self._limit, self._timeout = limit, timeout
+        self._voltage = 0.0
+        self._last: float | None = None
+        self.timed_out = False
+        self.rejected = self.clamped = self.timeouts = 0
+
+    @property
+    def last_command(self) -> float | None:
+        """Time (s) of the last command, rejected ones included; None if there was none."""
+        return self._last
+
+    def command(self, voltage: float, now: float) -> float:
+        """A command (V) arrived at `now` (s); returns what the motor gets. What is not finite gives 0 V."""
+        self._last, self.timed_out = now, False
+        if not math.isfinite(voltage):
+            self.rejected += 1
+            self._voltage = 0.0
+            return 0.0
+        clamped = min(max(voltage, -self._limit), self._limit)
+        self.clamped += clamped != voltage
+        self._voltage = clamped
+        return clamped
+
+    def voltage(self, now: float) -> float:
+        """What the motor gets at `now` (s): the last command, or 0 V once it is older than the timeout."""
+        if self._last is None:
+            return 0.0
+        if now - self._last >= self._timeout and not self.timed_out:
+            self.timed_out = True
+            self.timeouts += 1
+            self._voltage = 0.0
+        return self._voltage

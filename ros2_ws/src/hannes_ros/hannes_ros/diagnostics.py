@@ -1,0 +1,73 @@
+"""Health of a node on /diagnostics, once a second of wall time.
+
+`Health` only counts; it has no clock and no ROS. `Diagnostics` publishes it with a steady timer, so that it also works
+while simulated time stands still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from time import monotonic
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+from .topics import diagnostics_publisher
+
+OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE)
+
+
+class Health:
+    """Counters of a node: cycles done, last input, and named events (timeouts, missed cycles, rejected messages)."""
+
+    def __init__(self, *events: str) -> None:
+        self.cycles = 0
+        self.last_input: float | None = None
+        self.counts: dict[str, int] = dict.fromkeys(events, 0)
+
+    def count(self, event: str, by: int = 1) -> None:
+        """An event of that name happened."""
+        self.counts[event] = self.counts.get(event, 0) + by
+
+
+class Rate:
+    """Cycles a second between two looks at a counter."""
+
+    def __init__(self, now: float) -> None:
+        self._then, self._cycles = now, 0
+
+    def update(self, now: float, cycles: int) -> float:
+        """Rate (1/s) since the last update."""
+        elapsed = max(now - self._then, 1e-9)
+        rate = (cycles - self._cycles) / elapsed
+        self._then, self._cycles = now, cycles
+        return rate
+
+
+class Diagnostics:
+    """Publishes the health of one node.
+
+    state   called for each report: (level, message, further values)
+    """
+
+    def __init__(self, node: Node, health: Health,
+                 state: Callable[[], tuple[bytes, str, Mapping[str, object]]], period: float = 1.0) -> None:
+        self._node, self._health, self._state = node, health, state
+        self._publisher = diagnostics_publisher(node)
+        self._rate = Rate(monotonic())
+        self._timer = node.create_timer(period, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def publish(self) -> None:
+        """Report now."""
+        now, health = monotonic(), self._health
+        level, message, values = self._state()
+        age = "" if health.last_input is None else f"{now - health.last_input:.3f}"
+        pairs: dict[str, object] = {"rate_hz": f"{self._rate.update(now, health.cycles):.1f}",
+                                    "cycles": health.cycles, "input_age_s": age, **health.counts, **values}
+        status = DiagnosticStatus(level=level, name=self._node.get_fully_qualified_name(), message=message,
+                                  hardware_id="hannes",
+                                  values=[KeyValue(key=key, value=str(value)) for key, value in pairs.items()])
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(array)
