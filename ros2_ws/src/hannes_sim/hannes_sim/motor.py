@@ -8,7 +8,7 @@ from numba import njit
 
 from .native import call_effect, pointer_f8, pointer_i8
 from .ports import (
-    CURRENT, DELAY, DELAY_RING, DT, H_DELAY, H_EFFECTS, H_INPUTS, H_OUTPUTS, H_PARAMETERS, H_READING, H_STATE, KT_REL,
+    BRUSH, CURRENT, DELAY, DELAY_RING, DT, H_DELAY, H_EFFECTS, H_INPUTS, H_OUTPUTS, H_PARAMETERS, H_READING, H_STATE, KT_REL,
     N_OUTPUTS, P_CURRENT_OFFSET, P_DELAY, P_DT, P_EFFICIENCY, P_INDUCTANCE, P_KT, P_KT_NOMINAL, P_RATIO, P_RESISTANCE,
     P_RESOLUTION, P_SUPPLY, P_ZERO, R_CURRENT, R_EFFORT, R_POSITION, R_TIME, R_VELOCITY, RESISTANCE, RESISTANCE_REL,
     S_CURRENT, S_DELAY_INDEX, S_POSITION_READ, S_TIME_STEPS, SENSE_CURRENT, SENSE_CURRENT_GAIN, SENSE_POSITION, SUPPLY, T,
@@ -66,17 +66,23 @@ def motor_torque(handle):  # type: ignore[no-untyped-def]
 
     L di/dt = u - R i - Ke w, integrated exactly over the step for constant u and w (the electrical time constant,
     about 0.1 ms, is shorter than a step); torque = efficiency kt ratio i, with the mean current of the step so that
-    the impulse is exact too.  Without inductance the current follows at once.
+    the impulse is exact too.  Without inductance the current follows at once.  A dry voltage drop (brushes) is
+    solved implicitly, in the proximal form of dry_friction, because at zero current it is steeper than R.
     """
     p, s = pointer_f8(handle[H_PARAMETERS]), pointer_f8(handle[H_STATE])
     x, y = pointer_f8(handle[H_INPUTS]), pointer_f8(handle[H_OUTPUTS])
     kt = p[P_KT] * (1.0 + y[KT_REL])
     resistance = p[P_RESISTANCE] * (1.0 + y[RESISTANCE_REL])
-    final = (x[VOLTAGE] - y[VOLTAGE_DROP] - kt * p[P_RATIO] * x[V]) / resistance
+    drive = x[VOLTAGE] - y[VOLTAGE_DROP] - kt * p[P_RATIO] * x[V]
+    final = drive / resistance
     before = s[S_CURRENT]
-    if p[P_INDUCTANCE] > 0.0:
-        rate = resistance / p[P_INDUCTANCE] * p[P_DT]
-        decay = math.exp(-rate)
+    rate = resistance / p[P_INDUCTANCE] * p[P_DT] if p[P_INDUCTANCE] > 0.0 else math.inf
+    decay = math.exp(-rate)
+    if y[BRUSH] > 0.0:
+        held = drive + decay * resistance / (1.0 - decay) * before
+        final = ((max(held - y[BRUSH], 0.0) + min(held + y[BRUSH], 0.0)) * (1.0 - decay) / resistance
+                 - decay * before) / (1.0 - decay)
+    if rate < math.inf:
         after = final + (before - final) * decay
         mean = final + (before - final) * (1.0 - decay) / rate
     else:

@@ -39,7 +39,8 @@ SENSE_CURRENT = 13  # A, added to the measured current
 SENSE_CURRENT_GAIN = 14  # 1, relative change of the current sensor's gain
 DELAY = 15  # s, added to the delay of the command
 OBJECT_DAMPING = 16  # N.m.s/rad, added to the damping of the object
-N_OUTPUTS = 17
+BRUSH = 17  # V, added to the dry voltage drop against the current (solved implicitly)
+N_OUTPUTS = 18
 
 # What can be read from a plant after each advance: reading[...]
 R_TIME = 0  # s

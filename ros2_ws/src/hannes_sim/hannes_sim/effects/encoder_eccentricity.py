@@ -1,0 +1,32 @@
+"""The encoder's magnet runs out of true."""
+
+import math
+from typing import Any
+
+from ..effect import Effect, EffectParameter
+from ..ports import Q, SENSE_POSITION
+
+
+ENCODER_RATIO = 3.8  # turns of the pulley per turn of the encoder
+
+
+class EncoderEccentricity(Effect):
+    """An error of the measured position with the period of the encoder's turn.
+
+    Equation: q_measured = q + a sin(q / 3.8) + b (cos(q / 3.8) - 1): one turn of the encoder is 3.8 turns of the pulley (P09).
+    Limits: first harmonic only.
+    """
+
+    name = "encoder_eccentricity"
+    title = "encoder eccentricity"
+    parameters = (
+        EffectParameter("sine", "rad", -0.5, 0.5, 0.05, 0.0, "amplitude a"),
+        EffectParameter("cosine", "rad", -0.5, 0.5, 0.0, 0.0, "amplitude b"),
+    )
+    looks_like = "the tracking error and the current wave slowly with the angle, the same in every closure and at every speed"
+    told_by = "slow closures to full travel; compare with the finger joints"
+
+    @staticmethod
+    def contribute(x: Any, p: Any, s: Any, y: Any) -> None:
+        angle = x[Q] / ENCODER_RATIO
+        y[SENSE_POSITION] += p[0] * math.sin(angle) + p[1] * (math.cos(angle) - 1.0)

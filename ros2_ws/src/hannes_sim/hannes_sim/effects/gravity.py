@@ -1,0 +1,34 @@
+"""Weight of the fingers when the hand is not held as in the nominal pose."""
+
+import math
+from typing import Any
+
+from ..effect import Effect, EffectParameter
+from ..ports import LOAD_TORQUE, QL
+
+
+FINGER_PER_PULLEY = 0.098
+"""rad of metacarpophalangeal flexion per rad of pulley."""
+
+
+class Gravity(Effect):
+    """Gravity torque of the fingers at the pulley.
+
+    Equation: tau = -(g_c cos(a ql) + g_s sin(a ql)), a = 0.098 rad of finger per rad of pulley (82 degrees of MCP over 14.6 rad).
+    g_c: palm down or up, g_s: fingers up or down.
+    Limits: all fingers as one pendulum; the MuJoCo plant has the real masses.
+    """
+
+    name = "gravity"
+    title = "gravity and hand pose"
+    parameters = (
+        EffectParameter("cosine", "N.m", -0.05, 0.05, 0.005, 0.0, "torque g_c at the open hand"),
+        EffectParameter("sine", "N.m", -0.05, 0.05, 0.0, 0.0, "torque g_s at fingers bent by 90 degrees"),
+    )
+    looks_like = "an offset of the current that changes slowly with the closing angle and turns with the hand"
+    told_by = "the same closure in two poses of the hand"
+
+    @staticmethod
+    def contribute(x: Any, p: Any, s: Any, y: Any) -> None:
+        angle = FINGER_PER_PULLEY * x[QL]
+        y[LOAD_TORQUE] -= p[0] * math.cos(angle) + p[1] * math.sin(angle)

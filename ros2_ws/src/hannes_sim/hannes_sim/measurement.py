@@ -1,0 +1,125 @@
+"""The measurement chain: what the sensors and the logger make of a rollout.
+
+The chain is part of the model: the same averaging, rectification and sampling go over simulated and measured signals
+before they are compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hannes_description.errors import HannesError
+
+from .rollout import Rollout
+
+Array = NDArray[np.float64]
+Samples = Mapping[str, tuple[Array, Array]]
+"""Signal name -> (time (n,) s, values (n,))."""
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """How a hand is logged; a rate of 0 means that the signal is not logged.
+
+    motor_rate         Hz, encoder position and motor current (thesis P17: 30 Hz)
+    current_rectified  the log has |current| (thesis X17)
+    current_window     s, the logger averages the current over this trailing window; 0 = instantaneous
+    current_noise      A, standard deviation of one sample
+    voltage_rate       Hz, the commanded voltage
+    force_rate         Hz, grip force (thesis P17: 100 Hz, dynamometer only)
+    force_noise        N, standard deviation of one sample
+    reference_rate     Hz, the reference as the controller receives it
+    """
+
+    motor_rate: float = 30.0
+    current_rectified: bool = True
+    current_window: float = 1.0 / 30.0
+    current_noise: float = 0.005
+    voltage_rate: float = 0.0
+    force_rate: float = 0.0
+    force_noise: float = 0.5
+    reference_rate: float = 250.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not isinstance(value, bool) and not (math.isfinite(value) and value >= 0.0):
+                raise HannesError(f"Sensors: {item.name} is {value}; it must be finite and at least 0.")
+        if self.motor_rate == 0.0 or self.reference_rate == 0.0:
+            raise HannesError("Sensors: motor_rate and reference_rate must be positive.")
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Sensors:
+        unknown = sorted(set(content) - {item.name for item in fields(cls)})
+        if unknown:
+            raise HannesError(f"Sensors: unknown keys {unknown}; valid are "
+                              f"{', '.join(item.name for item in fields(cls))}.")
+        return cls(**content)
+
+    def sample(self, run: Rollout, rng: np.random.Generator | None = None) -> dict[str, tuple[Array, Array]]:
+        """Signals of a rollout as the log would hold them; with rng, noise is added."""
+        time = run.time
+        out: dict[str, tuple[Array, Array]] = {}
+        at = sample_times(time[0], time[-1], self.reference_rate)
+        out["reference_position"] = (at, take(time, run.reference_position, at))
+        at = sample_times(time[0], time[-1], self.motor_rate)
+        out["encoder_position"] = (at, take(time, run.encoder_position, at))
+        current = logged_current(time, run.motor_current, at, rectified=self.current_rectified,
+                                 window=self.current_window)
+        if rng is not None:
+            current = current + self.current_noise * rng.standard_normal(at.size)
+            if self.current_rectified:
+                current = np.abs(current)
+        out["motor_current"] = (at, current)
+        if self.voltage_rate > 0.0:
+            at = sample_times(time[0], time[-1], self.voltage_rate)
+            out["motor_voltage"] = (at, take(time, run.motor_voltage, at))
+        if self.force_rate > 0.0:
+            at = sample_times(time[0], time[-1], self.force_rate)
+            force = take(time, run.grip_force, at)
+            out["grip_force"] = (at, force if rng is None else force + self.force_noise * rng.standard_normal(at.size))
+        return out
+
+
+def sample_times(start: float, stop: float, rate: float) -> Array:
+    """start + k / rate up to stop, s."""
+    return start + np.arange(math.floor((stop - start) * rate + 1e-9) + 1) / rate
+
+
+def take(time: Array, values: Array, at: Array) -> Array:
+    """The value at or before each instant (zero-order hold); instants before the first take the first."""
+    index = np.searchsorted(time, at + 1e-9, side="right") - 1
+    return values[np.clip(index, 0, values.shape[0] - 1)]
+
+
+def logged_current(time: Array, current: Array, at: Array, *, rectified: bool, window: float) -> Array:
+    """The current [A] as a logger gives it at the instants `at`: rectified, averaged over the trailing window [s]."""
+    values = np.abs(current) if rectified else current
+    period = float(time[1] - time[0]) if time.size > 1 else 1.0
+    width = max(1, round(window / period))
+    if width == 1:
+        return take(time, values, at)
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    last = np.clip(np.searchsorted(time, at + 1e-9, side="right"), 1, values.size)
+    first = np.maximum(last - width, 0)
+    return (total[last] - total[first]) / (last - first)
+
+
+THESIS = Sensors()
+"""The thesis' log (P17): encoder and rectified current at 30 Hz."""
+
+BENCH = Sensors(motor_rate=100.0, current_rectified=False, current_window=0.01, current_noise=0.005, voltage_rate=100.0,
+                force_rate=100.0)
+"""A better log: signed current, voltage and force at 100 Hz."""
+
+SENSORS: Mapping[str, Sensors] = {"thesis": THESIS, "bench": BENCH}
+"""Sensor sets by name."""
