@@ -1,0 +1,109 @@
+"""The `hannes` command.
+
+Each subcommand is one line of COMMANDS: its name, the function or typer.Typer that carries it out (imported only when
+it is called, so that `hannes --help` is quick), and one sentence for the list. Exit codes: 0 done, 1 a node or a check
+failed, 2 wrong use or bad input (one line on stderr), 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import typer
+from hannes_description.errors import HannesError
+
+from .. import __version__
+
+
+@dataclass(frozen=True)
+class Command:
+    """A subcommand: `target` is "module:attribute", a function with typer annotations or a typer.Typer."""
+
+    name: str
+    target: str
+    help: str
+
+
+COMMANDS: tuple[Command, ...] = (
+    Command("run", "hannes_bringup.cli.run:app", "Start the whole node graph, or one node."),
+    Command("nodes", "hannes_bringup.cli.nodes:nodes", "Show what is running: nodes, topics, rates, ages."),
+    Command(
+        "record", "hannes_bringup.cli.bags:record", "Record the topics of the hand into a crash-safe bag."
+    ),
+    Command("play", "hannes_bringup.cli.bags:play", "Play a bag back onto the topics, with /clock."),
+    Command("model", "hannes_bringup.cli.model:app", "Show models: parameters with provenance, effects."),
+)
+"""Every subcommand, in the order of `hannes --help`."""
+
+_PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "allow_interspersed_args": False}
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"hannes {__version__}")
+        raise typer.Exit
+
+
+def build_app(commands: tuple[Command, ...] = COMMANDS) -> typer.Typer:
+    """The command line of those subcommands; none of their modules is imported yet."""
+    app = typer.Typer(
+        name="hannes",
+        help="A model of the Hannes prosthetic hand that can be held against the real one.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+
+    @app.callback()
+    def options(
+        show_version: Annotated[
+            bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+        ] = False,
+    ) -> None:
+        pass
+
+    for command in commands:
+        # the real command parses its own words, --help among them
+        app.command(command.name, help=command.help, add_help_option=False, context_settings=_PASS_ON)(
+            _caller(command)
+        )
+    return app
+
+
+def _caller(command: Command) -> Callable[[typer.Context], None]:
+    def call(context: typer.Context) -> None:
+        load(command)(args=context.args, prog_name=f"hannes {command.name}")
+
+    return call
+
+
+def load(command: Command) -> Any:
+    """Import the subcommand and make it a callable command line of its own."""
+    module, _, attribute = command.target.partition(":")
+    target = getattr(importlib.import_module(module), attribute)
+    if not isinstance(target, typer.Typer):
+        function = target
+        target = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+        target.command(help=function.__doc__ or command.help)(function)
+    return typer.main.get_command(target)
+
+
+def main() -> int:
+    """Entry point of `hannes`."""
+    try:
+        build_app()()
+    except HannesError as error:
+        print(f"hannes: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        # the reader of a pipe has gone (`hannes nodes | head`); say nothing when Python flushes at exit
+        sys.stdout = None
+        return 1
+    return 0

@@ -1,0 +1,73 @@
+"""`hannes model`: what a model file says."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from .output import JsonOption, number, print_json, print_table
+
+app = typer.Typer(
+    help="Models: nominal parameters plus effects.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+@app.callback()
+def _models() -> None:
+    pass
+
+
+@app.command()
+def show(
+    model: Annotated[
+        str, typer.Argument(help="Name of a shipped model, or path of a model file.")
+    ] = "nominal",
+    changed: Annotated[
+        bool, typer.Option("--changed", help="Only what differs from the nominal parameters.")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Show a model: every parameter with unit, bounds, status and source, and the effects that were added."""
+    from hannes_description.model import Model
+    from hannes_description.parameters import load_parameters
+
+    loaded = Model.load(model)
+    base = load_parameters(loaded.base)
+    parameters = {
+        name: parameter
+        for name, parameter in loaded.parameters.items()
+        if not changed or name not in base or base[name] != parameter
+    }
+    if json:
+        print_json(
+            {
+                "name": loaded.name,
+                "plant": loaded.plant,
+                "controller": loaded.controller,
+                "variant": dict(loaded.variant),
+                "sha256": loaded.sha256,
+                "parameters": {name: parameter.to_dict() for name, parameter in parameters.items()},
+                "effects": [effect.to_dict() for effect in loaded.effects],
+                "provenance": dict(loaded.provenance),
+            }
+        )
+        return
+    variant = ", ".join(f"{key} {value}" for key, value in loaded.variant.items()) or "none"
+    typer.echo(f"{loaded.name}: plant {loaded.plant}, controller {loaded.controller}, variant {variant}")
+    typer.echo(f"sha256 {loaded.sha256}\n")
+    columns = ("parameter", "value", "unit", "lower", "upper", "status", "source")
+    groups = [("Parameters", parameters)]
+    groups += [(f"Effect {effect.name}", dict(effect.parameters)) for effect in loaded.effects]
+    for title, entries in groups:
+        rows = [
+            (name, number(p.value), p.unit, number(p.lower), number(p.upper), p.status, p.source)
+            for name, p in entries.items()
+        ]
+        print_table(title, columns, rows, right=(1, 3, 4))
+    if not loaded.effects:
+        typer.echo("\nNo effects beyond the nominal model.")

@@ -1,0 +1,191 @@
+"""Looks at a running ROS 2 graph: which nodes and topics there are, and how often messages come."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.context import Context
+from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+
+DISCOVERY = 1.0
+"""s to wait for the graph before measuring; on one machine nodes are known after 0.1 s."""
+HIDDEN = ("/parameter_events", "/rosout")
+LEVELS = {b"\x00": "ok", b"\x01": "warn", b"\x02": "error", b"\x03": "stale"}
+
+
+@dataclass(frozen=True)
+class NodeSeen:
+    """A running node, the topics that it publishes and subscribes to, and what it says of its health."""
+
+    name: str
+    publishes: tuple[str, ...]
+    subscribes: tuple[str, ...]
+    health: str | None
+
+
+@dataclass(frozen=True)
+class TopicSeen:
+    """A topic: its messages in the window, rate (Hz) and age (s) of the last one; None where too few came."""
+
+    name: str
+    type: str
+    publishers: int
+    subscribers: int
+    messages: int
+    rate: float | None
+    age: float | None
+
+
+@dataclass(frozen=True)
+class GraphSeen:
+    """A look at the graph that took `window` seconds."""
+
+    domain_id: int
+    window: float
+    nodes: tuple[NodeSeen, ...]
+    topics: tuple[TopicSeen, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+class _Arrivals:
+    """Counts the messages of one topic by their arrival."""
+
+    def __init__(self, keep_last: bool) -> None:
+        self.count = 0
+        self.first = self.last = 0.0
+        self.kept: list[bytes] | None = [] if keep_last else None
+
+    def __call__(self, message: bytes) -> None:
+        self.last = time.monotonic()
+        self.first = self.first or self.last
+        self.count += 1
+        if self.kept is not None:
+            self.kept.append(message)
+
+
+def watch(window: float, context: Context | None = None) -> GraphSeen:
+    """Watch the graph for `window` seconds (plus discovery), without disturbing it: best-effort, raw subscriptions."""
+    own = context is None
+    if context is None:
+        context = Context()
+        rclpy.init(args=[], context=context)
+    node = Node(
+        f"_hannes_nodes_{os.getpid()}",
+        context=context,
+        use_global_arguments=False,
+        enable_rosout=False,
+        start_parameter_services=False,
+    )
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    try:
+        return _watch(node, executor, window)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        if own:
+            rclpy.try_shutdown(context=context)
+
+
+def _watch(node: Node, executor: Executor, window: float) -> GraphSeen:
+    _spin(executor, DISCOVERY)
+    subscribed: dict[str, _Arrivals] = {}
+    types = {name: kinds[0] for name, kinds in node.get_topic_names_and_types() if name not in HIDDEN}
+    for name, kind in types.items():
+        message = message_class(kind)
+        if message is not None and node.count_publishers(name):
+            subscribed[name] = _Arrivals(keep_last=name == "/diagnostics")
+            node.create_subscription(message, name, subscribed[name], _listener_qos(), raw=True)
+    started = time.monotonic()
+    _spin(executor, window)
+    now = time.monotonic()
+    topics = []
+    for name, kind in sorted(types.items()):
+        arrivals = subscribed.get(name)
+        count = arrivals.count if arrivals else 0
+        spread = arrivals.last - arrivals.first if arrivals else 0.0
+        topics.append(
+            TopicSeen(
+                name=name,
+                type=kind,
+                publishers=node.count_publishers(name),
+                subscribers=node.count_subscribers(name) - (1 if arrivals else 0),
+                messages=count,
+                rate=(count - 1) / spread if count > 1 and spread > 0.0 else None,
+                age=now - arrivals.last if arrivals and count else None,
+            )
+        )
+    diagnostics = subscribed.get("/diagnostics")
+    health = _health(diagnostics.kept if diagnostics and diagnostics.kept else [])
+    return GraphSeen(
+        domain_id=node.context.get_domain_id(),
+        window=now - started,
+        nodes=tuple(_nodes(node, health)),
+        topics=tuple(topics),
+    )
+
+
+def _nodes(node: Node, health: dict[str, str]) -> list[NodeSeen]:
+    seen = []
+    for name, namespace in sorted(set(node.get_node_names_and_namespaces())):
+        if name == node.get_name():
+            continue
+        full = f"{namespace.rstrip('/')}/{name}"
+        publishes: list[str] = []
+        subscribes: list[str] = []
+        # the node may end while it is looked at
+        with contextlib.suppress(RuntimeError):
+            publishes = [
+                t for t, _ in node.get_publisher_names_and_types_by_node(name, namespace) if t not in HIDDEN
+            ]
+            subscribes = [
+                t for t, _ in node.get_subscriber_names_and_types_by_node(name, namespace) if t not in HIDDEN
+            ]
+        said = next((level for who, level in health.items() if who in (full, full.lstrip("/"), name)), None)
+        seen.append(NodeSeen(full, tuple(sorted(publishes)), tuple(sorted(subscribes)), said))
+    return seen
+
+
+def _health(messages: list[bytes]) -> dict[str, str]:
+    """Name -> "level: message" of the latest diagnostics; names are cut at ':' as in "node: what"."""
+    health: dict[str, str] = {}
+    for message in messages:
+        for status in deserialize_message(message, DiagnosticArray).status:
+            health[status.name.partition(":")[0].strip()] = (
+                f"{LEVELS.get(status.level, '?')}: {status.message}"
+            )
+    return health
+
+
+def message_class(kind: str) -> Any | None:
+    """ "std_msgs/msg/Float64" -> the class; None if its package is not installed."""
+    package, _, name = kind.partition("/msg/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError):
+        return None
+
+
+def _listener_qos() -> QoSProfile:
+    # matches every publisher: best effort and volatile are the least that can be asked for
+    return QoSProfile(
+        depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
+    )
+
+
+def _spin(executor: Executor, duration: float) -> None:
+    end = time.monotonic() + duration
+    while (left := end - time.monotonic()) > 0.0:
+        executor.spin_once(min(left, 0.05))

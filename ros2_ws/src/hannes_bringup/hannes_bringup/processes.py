@@ -1,0 +1,115 @@
+"""Child processes that start together and stop together: SIGINT, then SIGTERM, then SIGKILL."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import FrameType, TracebackType
+
+from hannes_description.errors import HannesError
+
+GRACE_SIGINT = 5.0
+"""s that a process has after SIGINT before it gets SIGTERM (upstream launch: 5 s)."""
+GRACE_SIGTERM = 5.0
+"""s after SIGTERM before SIGKILL (upstream launch: 5 s)."""
+POLL = 0.05
+"""s between two looks at the processes."""
+
+
+@dataclass
+class ProcessGroup:
+    """Processes by name, each in a process group of its own so that Ctrl-C reaches them only through `stop`.
+
+    Use as a context manager: whatever happens inside, no process is left behind.
+    """
+
+    say: Callable[[str], None]
+    environment: Mapping[str, str] | None = None
+    _children: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
+
+    def __enter__(self) -> ProcessGroup:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def start(self, name: str, command: Sequence[str]) -> None:
+        """Start one process; HannesError if its program cannot be run."""
+        if name in self._children:
+            raise HannesError(f"Two processes are called '{name}'; give each node its own name.")
+        try:
+            self._children[name] = subprocess.Popen(
+                command,
+                env=None if self.environment is None else dict(self.environment),
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise HannesError(f"Cannot start '{name}' ({command[0]}): {error.strerror}.") from error
+        self.say(f"[{name}] started, pid {self._children[name].pid}")
+
+    @property
+    def running(self) -> list[str]:
+        return [name for name, child in self._children.items() if child.poll() is None]
+
+    @property
+    def exit_codes(self) -> dict[str, int]:
+        """Of those that have ended; a negative number is the signal that ended it."""
+        return {name: child.returncode for name, child in self._children.items() if child.poll() is not None}
+
+    def wait(self, until: Callable[[dict[str, int]], bool], timeout: float | None = None) -> bool:
+        """Wait until `until(exit_codes)` is true or nothing runs any more; False if `timeout` (s) passed first."""
+        end = None if timeout is None else time.monotonic() + timeout
+        while self.running and not until(self.exit_codes):
+            if end is not None and time.monotonic() >= end:
+                return False
+            time.sleep(POLL)
+        return True
+
+    def stop(self) -> dict[str, int]:
+        """End what still runs, politely first; the exit codes of all."""
+        for number, grace in (
+            (signal.SIGINT, GRACE_SIGINT),
+            (signal.SIGTERM, GRACE_SIGTERM),
+            (signal.SIGKILL, 5.0),
+        ):
+            waiting = self.running
+            if not waiting:
+                break
+            for name in waiting:
+                if number != signal.SIGINT:
+                    self.say(f"[{name}] still runs; {number.name}")
+                self._signal(name, number)
+            self.wait(lambda codes: False, timeout=grace)
+        for name, code in self.exit_codes.items():
+            if code not in (0, -signal.SIGINT):
+                self.say(f"[{name}] ended with exit code {code}")
+        return self.exit_codes
+
+    def _signal(self, name: str, number: int) -> None:
+        try:
+            os.killpg(self._children[name].pid, number)
+        except ProcessLookupError:
+            return  # it has just ended by itself
+
+
+class Interrupted(Exception):
+    """SIGINT or SIGTERM came."""
+
+
+def raise_on_signals() -> None:
+    """Let SIGINT and SIGTERM raise Interrupted in the main thread, once; further ones are ignored while stopping."""
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise Interrupted(signal.Signals(number).name)
+
+    signal.signal(signal.SIGINT, handler)
+    signal.signal(signal.SIGTERM, handler)
