@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 
 
 class CommandGate:
@@ -11,10 +12,12 @@ class CommandGate:
     limit    V, the command is clamped to [-limit, limit]
     timeout  s after the last command, by the caller's clock, from which the output is 0 V
     rejected, clamped, timeouts  counts
+    Commands may arrive in another thread than the one that asks for the voltage.
     """
 
     def __init__(self, limit: float, timeout: float) -> None:
         self._limit, self._timeout = limit, timeout
+        self._lock = threading.Lock()
         self._voltage = 0.0
         self._last: float | None = None
         self.timed_out = False
@@ -27,22 +30,20 @@ class CommandGate:
 
     def command(self, voltage: float, now: float) -> float:
         """A command (V) arrived at `now` (s); returns what the motor gets. What is not finite gives 0 V."""
-        self._last, self.timed_out = now, False
-        if not math.isfinite(voltage):
-            self.rejected += 1
-            self._voltage = 0.0
-            return 0.0
-        clamped = min(max(voltage, -self._limit), self._limit)
-        self.clamped += clamped != voltage
-        self._voltage = clamped
-        return clamped
+        with self._lock:
+            self._last, self.timed_out = now, False
+            self._voltage = min(max(voltage, -self._limit), self._limit) if math.isfinite(voltage) else 0.0
+            if not math.isfinite(voltage):
+                self.rejected += 1
+            elif self._voltage != voltage:
+                self.clamped += 1
+            return self._voltage
 
     def voltage(self, now: float) -> float:
-        """What the motor gets at `now` (s): the last command, or 0 V once it is older than the timeout."""
-        if self._last is None:
-            return 0.0
-        if now - self._last >= self._timeout and not self.timed_out:
-            self.timed_out = True
-            self.timeouts += 1
-            self._voltage = 0.0
-        return self._voltage
+        """What the motor gets at `now` (s): the last command, or 0 V once it is as old as the timeout."""
+        with self._lock:
+            if self._last is not None and not self.timed_out and now - self._last >= self._timeout:
+                self.timed_out = True
+                self.timeouts += 1
+                self._voltage = 0.0
+            return self._voltage

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from time import perf_counter, sleep
+from time import monotonic, sleep
 
 
 class RealtimeLoop:
@@ -36,13 +36,13 @@ class RealtimeLoop:
             self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
-        start, done = perf_counter(), 0
+        start, done = monotonic(), 0
         try:
             while not self._stop.is_set():
-                wait = start + (done + 1) * self._period - perf_counter()
+                wait = start + (done + 1) * self._period - monotonic()
                 if wait > 0.0:
                     sleep(wait)
-                now = perf_counter()
+                now = monotonic()
                 due = int((now - start) / self._period)
                 elapsed = max(due - done, 1)
                 self.missed += elapsed - 1

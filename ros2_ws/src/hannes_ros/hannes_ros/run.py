@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from rclpy.node import Node
 
 USAGE_ERROR = 2
-_SPIN_S = 0.5
+# A signal is noticed when spin_once returns.
+_SPIN_S = 0.1
 
 
 def run_node(*names: str, executor: str = "events", argv: Sequence[str] | None = None) -> int:
@@ -57,31 +58,89 @@ def _run(names: Sequence[str], executor: str, arguments: list[str]) -> int:
         _help(os.path.basename(arguments[0]), classes)
         return 0
     import rclpy
-    from rclpy.executors import ExternalShutdownException
 
-    context, nodes = _init(arguments), []
+    context = _init(arguments)
+    nodes: list[Any] = []
     try:
         spinner = _executor(executor, context)
         for cls in classes:
             nodes.append(_create(cls))
             spinner.add_node(nodes[-1])
-        for number in (signal.SIGINT, signal.SIGTERM):
-            # From here on rclpy's own handler shuts the context down, and the loop below sees it.
-            signal.signal(number, signal.SIG_IGN)
-        rclpy.signals.uninstall_signal_handlers()
-        rclpy.signals.install_signal_handlers(rclpy.signals.SignalHandlerOptions.ALL)
-        while context.ok() and not any(getattr(node, "done", False) for node in nodes):
+        stop = _StopOnSignal()
+        while context.ok() and not stop.asked and not any(getattr(node, "done", False) for node in nodes):
             spinner.spin_once(_SPIN_S)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     finally:
-        for node in nodes:
+        for node in reversed(nodes):
             if hasattr(node, "stop"):
                 node.stop()
-        for node in nodes:
+        for node in reversed(nodes):
             node.destroy_node()
-        rclpy.try_shutdown()
-    failed = [node.failure for node in nodes if getattr(node, "failure", None)]
-    if failed:
-        raise HannesError(str(failed[0]))
+        rclpy.try_shutdown(context=context)
+    failures = [node.failure for node in nodes if getattr(node, "failure", None)]
+    if failures:
+        raise HannesError(str(failures[0]))
     return 0
+
+
+class _StopOnSignal:
+    """Turns SIGINT and SIGTERM into a flag, so that no callback is interrupted halfway."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._ask)
+
+    def _ask(self, number: int, frame: object) -> None:
+        self.asked = True
+
+
+def _init(arguments: list[str]) -> Context:
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import get_default_context, remove_ros_args
+
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        others = remove_ros_args(arguments)[1:]
+    except RuntimeError as error:  # all that rclpy raises for a command line or a parameter file
+        raise HannesError(f"ROS arguments are not valid: {_first_line(error)}") from None
+    if others:
+        raise HannesError(f"Unknown argument '{others[0]}'; give parameters as '--ros-args -p name:=value' "
+                          "(--help lists them).")
+    return get_default_context()
+
+
+def _create(cls: Any) -> Node:
+    from rclpy.exceptions import NameValidationException
+    from rclpy.impl.implementation_singleton import rclpy_implementation
+
+    try:
+        node: Node = cls()
+        return node
+    except (rclpy_implementation.RCLError, NameValidationException) as error:
+        raise HannesError(f"The node cannot start: {_first_line(error)}") from None
+
+
+def _executor(name: str, context: Context) -> Executor:
+    if name == "events":
+        from rclpy.experimental import EventsExecutor
+
+        return EventsExecutor(context=context)
+    if name == "single":
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor(context=context)
+    raise HannesError(f"Executor '{name}' does not exist; valid are events, single.")
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().split("\n")[0].split(", at ")[0]
+
+
+def _help(program: str, classes: Sequence[Any]) -> None:
+    from .node_parameters import help_text
+
+    print(f"usage: {program} [--ros-args -p name:=value -r old:=new --params-file FILE.yaml ...]")
+    for cls in classes:
+        title = (cls.__doc__ or "").strip().split("\n")[0]
+        print(f"\n{cls.__name__}: {title}\n{help_text(cls.parameters) if hasattr(cls, 'parameters') else ''}")

@@ -1,0 +1,280 @@
+"""motor_controller: the double PID as a lifecycle node; motor/state, motor/current and a reference in, motor/voltage out."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from time import monotonic
+
+from hannes_description.errors import HannesError
+from hannes_description.model import Model
+from hannes_ros import convert, topics
+from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
+from hannes_ros.lockstep import Peers, TickJoin
+from hannes_ros.loop import RealtimeLoop
+from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
+from hannes_ros.node_parameters import declare, parameter
+from hannes_ros.run import run_node
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from .double_pid import DoublePID
+from .reference import FULL_CLOSURE, PROFILES, Profile, make_profile
+
+_CHECK_S = 0.02
+_ZERO = convert.float64_bytes(0.0)
+
+
+@dataclass(frozen=True)
+class MotorControllerParameters:
+    """ROS parameters of motor_controller."""
+
+    model: str = parameter("nominal", "model whose gains and limits are used: name or path of a model file")
+    clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
+    period: float = parameter(1e-3, "control period", lower=1e-4, upper=1e-1, unit="s")
+    autostart: bool = parameter(True, "configure and activate at start; otherwise wait for the lifecycle services")
+    reference: str = parameter("topic", "topic, or a profile of its own from the activation on",
+                               choices=("topic", *PROFILES))
+    reference_closures: int = parameter(1, "closures of the profile", lower=1, upper=100000)
+    reference_amplitude: float = parameter(FULL_CLOSURE, "amplitude of the profile", lower=1e-3, upper=100.0, unit="rad")
+    reference_period: float = parameter(0.0, "period of the profile, 0 for its own", lower=0.0, upper=1e3, unit="s")
+    state_timeout_ms: float = parameter(50.0, "age of motor/state or motor/current from which the command is 0 V",
+                                        lower=1.0, upper=1e4, unit="ms")
+    pause_limit_ms: float = parameter(80.0, "a pause of the control loop longer than this deactivates the node",
+                                      lower=1.0, upper=1e4, unit="ms")
+
+    def profile(self) -> Profile | None:
+        """The profile (n,) in rad, None for the topic."""
+        if self.reference == "topic":
+            return None
+        options = {"period": self.reference_period} if self.reference_period > 0.0 else {}
+        return make_profile(self.reference, closures=self.reference_closures, amplitude=self.reference_amplitude,
+                            dt=self.period, **options)
+
+
+class MotorController(HannesNode, LifecycleNode):
+    """Drives the motor to the reference position; commands only while active."""
+
+    parameters = MotorControllerParameters
+
+    def __init__(self) -> None:
+        super().__init__("motor_controller", namespace=DEFAULT_NAMESPACE)
+        self._p = p = declare(self, MotorControllerParameters)
+        model = Model.load(p.model)
+        if model.controller != "double_pid":
+            raise HannesError(f"Model '{model.name}' asks for the controller '{model.controller}'; this node runs "
+                              "double_pid only.")
+        self._pid = DoublePID.of_model(model.parameters, p.period)
+        self._limit = self._pid.settings.voltage_limit
+        self._profile = p.profile()
+        self._lockstep = p.clock == "lockstep"
+        self._active = self._tripped = False
+        self._health = Health("rejected_states", "rejected_inputs", "state_timeouts", "trips", "resets")
+        self._state: convert.JointSample | None = None
+        self._current: float | None = None
+        self._reference: float | None = None
+        self._state_at = self._current_at = self._reference_at = 0.0
+        self._stale = False
+        self._start = 0
+        self._answered = -1
+        self._join = TickJoin(2 if self._profile is not None else 3)
+        self._loop: RealtimeLoop | None = None
+        self._missed = 0
+
+        self._voltage = topics.publisher(self, "motor_voltage")
+        topics.subscription(self, "encoder_position", self._on_tick_state if self._lockstep else self._on_state)
+        topics.subscription(self, "motor_current", self._on_tick_current if self._lockstep else self._on_current)
+        if self._profile is None:
+            topics.subscription(self, "reference_position",
+                                self._on_tick_reference if self._lockstep else self._on_reference)
+        self._peers = Peers({"a subscriber of motor/voltage": (self._voltage.get_subscription_count, 1)})
+        self._diagnostics = Diagnostics(self, self._health, self._status)
+        self.wall_timer(_CHECK_S, self._check)
+        if p.autostart:
+            self.trigger_configure()
+            self.trigger_activate()
+
+    # -- life cycle --------------------------------------------------------------------------------------------------
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Ready, motor off."""
+        self._pid.reset()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Motor on, from a cleared controller."""
+        self._clear()
+        self._active, self._tripped = True, False
+        if self._lockstep:
+            self._answer()
+        else:
+            self._start = -1
+            self._loop = RealtimeLoop(self._p.period, self._step)
+            self._loop.start()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Motor off, integrators cleared."""
+        self._off()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Motor off."""
+        self._off()
+        return TransitionCallbackReturn.SUCCESS
+
+    def stop(self) -> None:
+        """Motor off; the process ends."""
+        self._off()
+
+    def _off(self) -> None:
+        was_active, self._active = self._active, False
+        if self._loop is not None:
+            self._loop.stop()
+            self._missed += self._loop.missed
+            self._loop = None
+        if was_active and not self._lockstep:
+            self._voltage.publish(_ZERO)
+        self._clear()
+
+    def _clear(self) -> None:
+        self._pid.reset()
+        self._health.count("resets")
+
+    # -- the law -----------------------------------------------------------------------------------------------------
+    def _command(self, reference: float, position: float, current: float) -> float:
+        """Voltage (V), clamped; what is not finite gives 0 V and a cleared controller."""
+        try:
+            voltage = self._pid.update(reference, position, current)
+        except HannesError:
+            self._health.count("rejected_inputs")
+            self._clear()
+            return 0.0
+        return min(max(voltage, -self._limit), self._limit)
+
+    def _decode(self, data: bytes) -> convert.JointSample | None:
+        try:
+            return convert.MOTOR_STATE.decode(data)
+        except HannesError as error:
+            self._health.count("rejected_states")
+            self.get_logger().error(f"motor/state is rejected: {error}", throttle_duration_sec=5.0)
+            return None
+
+    def _profile_at(self, tick: int) -> float:
+        assert self._profile is not None
+        return float(self._profile[min(max(tick, 0), self._profile.size - 1)])
+
+    # -- real time ---------------------------------------------------------------------------------------------------
+    def _on_state(self, data: bytes) -> None:
+        sample = self._decode(data)
+        if sample is None:
+            return
+        age_ns = self.get_clock().now().nanoseconds - sample.stamp_ns
+        backwards = self._state is not None and sample.stamp_ns <= self._state.stamp_ns and not self._stale
+        if backwards or age_ns > self._p.state_timeout_ms * 1e6:
+            self._health.count("rejected_states")
+            return
+        self._state, self._state_at = sample, monotonic()
+
+    def _on_current(self, data: bytes) -> None:
+        self._current, self._current_at = convert.float64_value(data), monotonic()
+
+    def _on_reference(self, data: bytes) -> None:
+        self._reference, self._reference_at = convert.float64_value(data), monotonic()
+
+    def _step(self, now: float, elapsed: int) -> None:
+        """One period of the real-time thread."""
+        self._start += elapsed
+        if not self._active or self._tripped:
+            return
+        if elapsed * self._p.period * 1e3 > self._p.pause_limit_ms:
+            self._tripped = True
+            return
+        if self._state is None or self._current is None:
+            return
+        if now - min(self._state_at, self._current_at) > self._p.state_timeout_ms / 1e3:
+            if not self._stale:
+                self._stale = True
+                self._health.count("state_timeouts")
+                self._clear()
+            voltage = 0.0
+        else:
+            self._stale = False
+            reference = self._reference if self._profile is None else self._profile_at(self._start)
+            voltage = 0.0 if reference is None else self._command(reference, self._state.position[0], self._current)
+        self._voltage.publish(convert.float64_bytes(voltage))
+        self._health.cycles += 1
+
+    # -- lock-step ---------------------------------------------------------------------------------------------------
+    def _on_tick_state(self, data: bytes) -> None:
+        sample = self._decode(data)
+        if sample is None:
+            return
+        if sample.stamp_ns < self._answered:  # the simulator began again
+            self._join.reset()
+            self._answered = -1
+            self._clear()
+        self._state_at = monotonic()
+        self._join.put(0, sample)
+        self._answer()
+
+    def _on_tick_current(self, data: bytes) -> None:
+        self._join.put(1, convert.float64_value(data))
+        self._answer()
+
+    def _on_tick_reference(self, data: bytes) -> None:
+        self._join.put(2, convert.float64_value(data))
+        self._answer()
+
+    def _answer(self) -> None:
+        """Answer the tick if all of it is here, the motor is on and the answer will be heard."""
+        while self._active and self._peers.complete and (tick := self._join.take()) is not None:
+            sample, current = tick[0], tick[1]
+            if sample.stamp_ns == self._answered:
+                continue
+            reference = tick[2] if self._profile is None else self._profile_at(
+                round(sample.stamp_ns / (self._p.period * 1e9)))
+            self._answered = sample.stamp_ns
+            self._join.synchronise()
+            self._health.cycles += 1
+            self._voltage.publish(convert.float64_bytes(self._command(reference, sample.position[0], current)))
+
+    # -- health ------------------------------------------------------------------------------------------------------
+    def _check(self) -> None:
+        if self._lockstep and not self._peers.complete and not self._peers.missing():
+            self._answer()
+        if self._loop is not None and self._loop.error is not None:
+            self.fail(f"The control loop stopped: {self._loop.error!r}")
+        if self._tripped and self._active:
+            self._health.count("trips")
+            self.get_logger().error(f"the control loop paused for more than {self._p.pause_limit_ms:g} ms: motor off; "
+                                    "activate the node again")
+            self.trigger_deactivate()
+            self._diagnostics.publish()
+
+    def _status(self) -> tuple[bytes, str, dict[str, object]]:
+        self._health.last_input = self._state_at or None
+        values = {"missed_cycles": self._missed + (self._loop.missed if self._loop else 0), "active": self._active,
+                  "battery_saver": self._pid.saving, "reference_age_s": f"{monotonic() - self._reference_at:.3f}"
+                  if self._reference_at else ""}
+        if not self._active:
+            return WARN, "not active: motor off" + ("; activate again" if self._tripped else ""), values
+        if self._lockstep and not self._peers.complete:
+            return WARN, "waiting for a subscriber of motor/voltage", values
+        names = ("motor/state", "motor/current", "reference_position")
+        if self._lockstep:
+            missing = [names[slot] for slot in self._join.missing()]
+            return OK, f"waiting for {', '.join(missing)}" if missing else "running", values
+        if self._stale:
+            return ERROR, "motor/state or motor/current is too old: 0 V", values
+        absent = [name for name, value in zip(names, (self._state, self._current,
+                                                      self._reference if self._profile is None else 0.0), strict=True)
+                  if value is None]
+        return (WARN, f"waiting for {', '.join(absent)}", values) if absent else (OK, "running", values)
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run_node("hannes_control.motor_controller_node:MotorController"))
+
+
+if __name__ == "__main__":
+    main()
