@@ -65,7 +65,8 @@ class ClockRelation:
         if self.kind == "offset":
             return (
                 f"The stamps of {self.topic} and the recorder's times are on different clocks, "
-                f"{self.offset_ns * 1e-9:.3f} s apart at the median: the times of messages without a header were shifted by that much."
+                f"{self.offset_ns * 1e-9:.3f} s apart at the median: the times of messages without a header were "
+                "shifted by that much."
             )
         if self.kind == "warped":
             return (

@@ -124,8 +124,8 @@ class McapWriter:
         )
 
     def end_chunk(self) -> None:
-        """End the chunk at hand, if it holds messages, and hand it to the stream (which the caller may then
-        flush)."""
+        """End the chunk at hand, if it holds messages, and give it to the stream (flushing is the
+        caller's)."""
         if not self._index:
             return
         raw = b"".join(self._chunk)
@@ -340,6 +340,7 @@ class McapScan:
                 self.damage.append(damage)
                 following = _next_chunk(buffer, position + 1)
                 if following is None:
+                    yield from self._cut_chunk(position, size)
                     return
                 position = following
 
@@ -368,6 +369,25 @@ class McapScan:
         if crc and zlib.crc32(data) != crc:
             raise McapDamage("a chunk fails its checksum", begin)
         yield from self._chunk_messages(data, begin)
+
+    def _cut_chunk(self, position: int, size: int) -> Iterator[tuple[int, int, int, memoryview]]:
+        """The whole messages in front of the cut, if the record at `position` is a chunk without its end."""
+        buffer = self.buffer
+        if position + 61 > size or buffer[position] != Opcode.CHUNK:
+            return
+        _, length = _RECORD_HEAD.unpack_from(buffer, position)
+        begin = position + 9
+        if begin + length <= size:
+            return
+        try:
+            _, _, unpacked, _ = _CHUNK_BODY.unpack_from(buffer, begin)
+            name, at = _string(buffer, begin + _CHUNK_BODY.size, size)
+            data = _decompress(buffer[at + 8 :], name, min(unpacked, self.limits.chunk_bytes), begin)
+            for message in self._chunk_messages(data, begin):
+                self.salvaged_bytes = size
+                yield message
+        except McapDamage:
+            return
 
     def _chunk_messages(self, data: memoryview, origin: int) -> Iterator[tuple[int, int, int, memoryview]]:
         position, size = 0, len(data)
@@ -467,8 +487,7 @@ class McapScan:
 
 
 def _record(buffer: memoryview, position: int, size: int) -> tuple[int, int, int]:
-    """Opcode, begin and end of the record at `position`; raises McapDamage if it does not fit into the
-    file."""
+    """Opcode, begin and end of the record at `position`; McapDamage if it does not fit into the file."""
     if position + 9 > size:
         raise McapDamage("the file is cut within a record", position)
     opcode, length = _RECORD_HEAD.unpack_from(buffer, position)
@@ -481,8 +500,7 @@ def _record(buffer: memoryview, position: int, size: int) -> tuple[int, int, int
 
 
 def _next_chunk(buffer: memoryview, position: int) -> int | None:
-    """Where the next plausible chunk begins (kind, a length that fits, ordered times, a known
-    compression)."""
+    """Where the next plausible chunk begins: its kind, a length that fits, ordered times."""
     size = len(buffer)
     step = 1 << 20
     while position < size:
@@ -537,8 +555,7 @@ def _string_map(data: memoryview, position: int, end: int) -> dict[str, str]:
 
 
 def _decompress(data: memoryview, name: str, size: int, origin: int) -> memoryview:
-    """Unpack at most `size` + 1 bytes, so that a bomb shows as a wrong length instead of filling the
-    memory."""
+    """Unpack at most `size` + 1 bytes: a bomb shows as a wrong length instead of filling the memory."""
     if name == "":
         return data
     try:

@@ -181,6 +181,7 @@ class _Reader:
             else:
                 times, values = self._plain(topic, signals[0])
                 samples[signals[0].name] = (relation.apply(times), values)
+                self._drop_repeats([signals[0].name], samples)
         ordered = {name: self._in_order(name, *samples[name]) for name in SIGNALS if name in samples}
         if not ordered:
             raise HannesError(f"The bag {self.path} has no usable signal. " + " ".join(self.warnings))
@@ -317,8 +318,28 @@ class _Reader:
             indices = np.concatenate([block.indices for block, _, _ in present])
             values = np.concatenate([field[:, column] for _, column, field in present])
             order = np.argsort(indices, kind="stable")
-            values = values[order, 0] if scalar else values[order]
-            samples[signal.name] = (times[indices[order]], values)
+            samples[signal.name] = (times[indices[order]], values[order])
+        self._drop_repeats([signal.name for signal in signals if signal.name in samples], samples)
+        if scalar:
+            for signal in signals:
+                if signal.name in samples:
+                    stamps, values = samples[signal.name]
+                    samples[signal.name] = (stamps, values[:, 0])
+
+    def _drop_repeats(self, names: list[str], samples: dict[str, tuple[IntArray, npt.NDArray[Any]]]) -> None:
+        """Leave out messages that repeat the one before them, stamp and all (lock-step repeats to
+        newcomers)."""
+        if not names or len({len(samples[name][0]) for name in names}) != 1:
+            return
+        times = samples[names[0]][0]
+        repeated = np.concatenate([[False], np.diff(times) == 0])
+        for name in names:
+            values = samples[name][1]
+            unequal = (values[1:] != values[:-1]).reshape(len(values) - 1, -1).any(axis=1)
+            repeated[1:] &= ~unequal
+        if repeated.any():
+            for name in names:
+                samples[name] = (samples[name][0][~repeated], samples[name][1][~repeated])
 
     def _columns(self, topic: str, block: cdr.JointStates, scalar: bool) -> list[int] | None:
         """Columns of the joints that this topic is about; None if the block is of other joints."""

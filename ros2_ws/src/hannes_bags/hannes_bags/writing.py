@@ -27,6 +27,12 @@ from .recording import Channel, Recording
 from .storage import MCAP_METADATA, METADATA_FILE, encode_entries
 
 FORMAT = "hannes_bags 1"
+_QOS_NAMES = {
+    "history": ("system_default", "keep_last", "keep_all", "unknown"),
+    "reliability": ("system_default", "reliable", "best_effort", "unknown", "best_available"),
+    "durability": ("system_default", "transient_local", "volatile", "unknown", "best_available"),
+}
+"""Names by number, as versions up to 8 store them (rmw's enumerations)."""
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 
 
@@ -38,6 +44,35 @@ class Qos:
     durability: str = "volatile"
     history: str = "keep_last"
     depth: int = 10
+
+    @staticmethod
+    def from_text(text: str) -> Qos:
+        """The first profile of a stored offered_qos_profiles; the default where it cannot be understood."""
+        try:
+            profiles = yaml.load(text[:20_000], Loader=yaml.SafeLoader)
+        except (
+            yaml.YAMLError,
+            ValueError,
+            RecursionError,
+            OverflowError,
+            TypeError,
+            AttributeError,
+            LookupError,
+        ):
+            return Qos()
+        if not isinstance(profiles, list) or not profiles or not isinstance(profiles[0], dict):
+            return Qos()
+        values: dict[str, Any] = {}
+        for key, names in _QOS_NAMES.items():
+            value = profiles[0].get(key)
+            if isinstance(value, int) and not isinstance(value, bool):
+                value = names[value] if 0 <= value < len(names) else None
+            if value in names:
+                values[key] = value
+        depth = profiles[0].get("depth")
+        if isinstance(depth, int) and not isinstance(depth, bool) and 0 <= depth < 2**31:
+            values["depth"] = depth
+        return Qos(**values)
 
     def as_dict(self) -> dict[str, Any]:
         return {
