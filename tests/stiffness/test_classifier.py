@@ -1,4 +1,4 @@
-"""The trained classifier: the same on disk as in memory, the same again from the same seed, refused when broken."""
+"""The trained classifier: on disk as in memory, the same from the same seed, refused when broken."""
 
 import json
 from dataclasses import replace

@@ -18,15 +18,15 @@ def closure(rate: float, duration: float = 8.0, seed: int = 0, jitter: float = 0
     return t, current, reference, encoder
 
 
-def stream(arrays, spec=None):
-    feed = FeatureStream(spec or FeatureSpec())
+def stream(arrays, spec=None, rate=None):
+    feed = FeatureStream(spec or FeatureSpec(), rate)
     samples = [s for s in (feed.push(*map(float, row)) for row in zip(*arrays, strict=True)) if s is not None]
     return feed, samples
 
 
-def assert_same(arrays, spec=None):
-    feed, samples = stream(arrays, spec)
-    batch = extract(*arrays, spec)
+def assert_same(arrays, spec=None, rate=None):
+    feed, samples = stream(arrays, spec, rate)
+    batch = extract(*arrays, spec, rate)
     assert len(samples) == len(batch.time)
     np.testing.assert_array_equal([s.time for s in samples], batch.time)
     np.testing.assert_array_equal(
@@ -43,6 +43,17 @@ def assert_same(arrays, spec=None):
 def test_stream_equals_arrays_at_every_rate(rate, jitter, current):
     batch = assert_same(closure(rate, jitter=jitter), FeatureSpec(current=current))
     assert len(batch.time) <= 8.0 * min(rate, 30.0) + 2
+
+
+@pytest.mark.parametrize("rate", [7.0, 30.0, 100.0, 1000.0])
+def test_answers_may_come_at_another_rate_with_the_same_meaning(rate):
+    arrays = closure(1000.0)
+    batch = assert_same(arrays, rate=rate)
+    np.testing.assert_allclose(len(batch.time), 8.0 * rate, atol=1)
+    dense = extract(*arrays, rate=1000.0)
+    same = np.searchsorted(dense.time, batch.time)
+    np.testing.assert_array_equal(dense.values[same], batch.values)
+    np.testing.assert_array_equal(dense.void[same], batch.void)
 
 
 def test_stream_equals_arrays_over_gaps_restarts_and_bad_values():
@@ -132,6 +143,11 @@ def test_hold_never_looks_ahead_and_forgets_old_values():
 def test_a_wrong_setting_is_named(change, word):
     with pytest.raises(HannesError, match=word):
         FeatureSpec(**change)
+
+
+def test_a_rate_that_cannot_be_is_refused():
+    with pytest.raises(HannesError, match="rate of answers"):
+        FeatureStream(rate=0.0)
 
 
 def test_arrays_of_different_length_are_refused():

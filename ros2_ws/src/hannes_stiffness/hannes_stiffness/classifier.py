@@ -47,7 +47,7 @@ class TreeSettings:
     """
 
     trees: int = 30
-    leaves: int = 128
+    leaves: int = 256
     leaf: int = 5
     folds: int = 5
 

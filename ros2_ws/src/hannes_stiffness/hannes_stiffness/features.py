@@ -19,6 +19,7 @@ after it.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
@@ -83,13 +84,16 @@ class FeatureSpec:
 
     @property
     def period(self) -> float:
+        """Time between samples, s."""
         return 1.0 / self.rate
 
     def to_dict(self) -> dict[str, object]:
+        """Plain types, for the manifest."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, content: object, where: str) -> FeatureSpec:
+        """From a manifest; `where` begins the message of the HannesError that names what is wrong."""
         known = [f.name for f in fields(cls)]
         if not isinstance(content, Mapping) or set(content) != set(known):
             raise HannesError(
@@ -138,21 +142,23 @@ def believable(current: ArrayLike, reference: ArrayLike, encoder: ArrayLike) -> 
 class FeatureStream:
     """Feature samples from a stream, one input sample at a time.
 
-    `push` answers a `Sample` when one is due (about `spec.rate` a second, never more often than the input),
-    else None. `rejected` and `restarts` count as in `Features`.
+    `push` answers a `Sample` when one is due (about `rate` a second, by default `spec.rate`, and never more
+    often than the input), else None. `rejected` and `restarts` count as in `Features`.
     """
 
     spec: FeatureSpec = field(default_factory=FeatureSpec)
+    rate: float | None = None
     rejected: int = 0
     restarts: int = 0
 
     def __post_init__(self) -> None:
+        self._period = 1.0 / _checked_rate(self.spec, self.rate)
         self._last: float | None = None
         self._begin(0.0)
 
     def _begin(self, time: float) -> None:
         self._anchor = time
-        self._tick = -1
+        self._tick = self._due = -1
         self._window: deque[tuple[float, float]] = deque()
         self._before: tuple[float, float] | None = None
         self._rising = False
@@ -166,7 +172,7 @@ class FeatureStream:
         """Take the values at `time` (s, A, rad, rad)."""
         spec = self.spec
         if not (
-            np.isfinite(time)
+            math.isfinite(time)
             and abs(current) <= _PLAUSIBLE[0]
             and abs(reference) <= _PLAUSIBLE[1]
             and abs(encoder) <= _PLAUSIBLE[2]
@@ -187,11 +193,20 @@ class FeatureStream:
         oldest = time - _AVERAGED * spec.period
         while self._window[0][0] <= oldest:
             self._window.popleft()
-        tick = int(np.floor((time - self._anchor) / spec.period + _EARLY))
-        if tick <= self._tick:
+        tick = math.floor((time - self._anchor) / spec.period + _EARLY)
+        if tick > self._tick:
+            self._tick = tick
+            self._watch(time, reference)
+        due = math.floor((time - self._anchor) / self._period + _EARLY)
+        if due <= self._due:
             return None
-        self._tick = tick
+        self._due = due
+        mean = float(np.mean(np.array([c for _, c in self._window])))
+        void = abs(mean) < spec.void_current or time - self._onset < spec.mask
+        return Sample(time, (mean, reference, encoder), void)
 
+    def _watch(self, time: float, reference: float) -> None:
+        """Notice the start of a closure."""
         if self._before is not None:
             rate = (reference - self._before[1]) / (time - self._before[0])
             if rate > _RISES and not self._rising:
@@ -199,9 +214,13 @@ class FeatureStream:
             elif rate <= _RESTS:
                 self._rising = False
         self._before = (time, reference)
-        mean = float(np.mean(np.array([c for _, c in self._window])))
-        void = abs(mean) < spec.void_current or time - self._onset < spec.mask
-        return Sample(time, (mean, reference, encoder), void)
+
+
+def _checked_rate(spec: FeatureSpec, rate: float | None) -> float:
+    rate = spec.rate if rate is None else rate
+    if not 0.1 <= rate <= 10_000.0:
+        raise HannesError(f"The rate of answers is {rate!r}; it must be from 0.1 to 10000 a second.")
+    return rate
 
 
 def extract(
@@ -210,12 +229,14 @@ def extract(
     reference: ArrayLike,
     encoder: ArrayLike,
     spec: FeatureSpec | None = None,
+    rate: float | None = None,
 ) -> Features:
     """Feature samples of whole arrays, equal to pushing them one by one through `FeatureStream`.
 
     time (n,) s; current (n,) A; reference, encoder (n,) rad. Raises HannesError where the lengths differ.
     """
     spec = spec or FeatureSpec()
+    period = 1.0 / _checked_rate(spec, rate)
     t, i, r, q = (np.asarray(a, dtype=float) for a in (time, current, reference, encoder))
     if t.ndim != 1 or not t.shape == i.shape == r.shape == q.shape:
         raise HannesError(
@@ -237,10 +258,8 @@ def extract(
         stop = start + 1 + int(breaks[0]) if len(breaks) else len(t)
         forward = np.r_[True, step[: stop - start - 1] > 0.0]
         rejected += int(np.count_nonzero(~forward))
-        part = slice(start, stop)
-        pieces.append(
-            _extract_stretch(t[part][forward], i[part][forward], r[part][forward], q[part][forward], spec)
-        )
+        t_, i_, r_, q_ = (x[start:stop][forward] for x in (t, i, r, q))
+        pieces.append(_extract_stretch(t_, i_, r_, q_, spec, period))
         start = stop
     if not pieces:
         return Features(np.empty(0), np.empty((0, 3), np.float32), np.empty(0, bool), rejected, 0)
@@ -259,22 +278,28 @@ def _extract_stretch(
     r: NDArray[np.float64],
     q: NDArray[np.float64],
     spec: FeatureSpec,
+    period: float,
 ) -> Features:
     """One stretch without holes, strictly forward in time."""
-    tick = np.floor((t - t[0]) / spec.period + _EARLY)
-    due = np.flatnonzero(np.r_[True, np.diff(tick) > 0])
+    watched, due = _ticks(t, spec.period), _ticks(t, period)
     first = np.searchsorted(t, t[due] - _AVERAGED * spec.period, side="right")
     mean = np.array([np.mean(i[a : b + 1]) for a, b in zip(first, due, strict=True)])
-    t, r, q = t[due], r[due], q[due]
 
-    rate = np.diff(r) / np.diff(t)
+    rate = np.diff(r[watched]) / np.diff(t[watched])
     # 1 where the reference rises, -1 where it rests, 0 where the state before holds; it starts at rest.
     switch = np.r_[-1, np.where(rate > _RISES, 1, np.where(rate <= _RESTS, -1, 0))]
     held = switch[np.maximum.accumulate(np.where(switch != 0, np.arange(len(switch)), 0))]
     starts = np.r_[False, (held[1:] == 1) & (held[:-1] == -1)]
-    onset = np.maximum.accumulate(np.where(starts, t, -np.inf))
-    void = (np.abs(mean) < spec.void_current) | (t - onset < spec.mask)
-    return Features(t, np.column_stack([mean, r, q]).astype(np.float32), void)
+    onset = np.maximum.accumulate(np.where(starts, t[watched], -np.inf))
+    latest = onset[np.searchsorted(watched, due, side="right") - 1]
+    void = (np.abs(mean) < spec.void_current) | (t[due] - latest < spec.mask)
+    return Features(t[due], np.column_stack([mean, r[due], q[due]]).astype(np.float32), void)
+
+
+def _ticks(t: NDArray[np.float64], period: float) -> NDArray[np.intp]:
+    """Indices of the samples that are the first of their tick."""
+    tick = np.floor((t - t[0]) / period + _EARLY)
+    return np.flatnonzero(np.r_[True, np.diff(tick) > 0])
 
 
 def hold(time: ArrayLike, values: ArrayLike, at: ArrayLike) -> NDArray[np.float64]:

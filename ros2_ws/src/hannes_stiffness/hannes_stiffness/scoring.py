@@ -47,10 +47,12 @@ class Score:
 
     @property
     def count(self) -> int:
+        """How many were scored."""
         return int(self.confusion.sum())
 
     @property
     def accuracy(self) -> float:
+        """Part that was answered rightly; NaN where nothing was scored."""
         return float(np.trace(self.confusion) / self.count) if self.count else float("nan")
 
     @property
@@ -60,6 +62,8 @@ class Score:
         return float(np.mean(present)) if present else float("nan")
 
     def to_dict(self) -> dict[str, object]:
+        """Plain types for JSON; None where a score does not exist."""
+
         def number(value: float) -> float | None:
             return None if np.isnan(value) else round(float(value), 6)
 
@@ -183,6 +187,7 @@ class WindowScores:
     pooled: Score
 
     def to_dict(self) -> dict[str, object]:
+        """Plain types for JSON."""
         return {
             "window_s": WINDOW,
             "hop_s": self.hop,

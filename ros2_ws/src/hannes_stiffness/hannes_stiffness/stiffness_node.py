@@ -1,0 +1,169 @@
+"""The node `stiffness_classifier`: motor current, reference and encoder in; label, class and probability out.
+
+Time is the stamp of motor/state, so simulated, recorded and real time all work, at any rate of the inputs. In real time
+each state meets the newest current and reference; in lock-step the messages of one tick meet.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from time import monotonic
+
+from hannes_description.errors import HannesError
+from hannes_description.joints import ENCODER_JOINT
+from hannes_description.signals import STIFFNESS_CLASSES
+from hannes_ros.convert import JointCodec, JointSample, float64_bytes, float64_value
+from hannes_ros.diagnostics import OK, WARN, Diagnostics, Health
+from hannes_ros.lockstep import TickJoin
+from hannes_ros.node_parameters import declare, parameter
+from hannes_ros.run import run_node
+from hannes_ros.topics import publisher, subscription
+from rclpy.node import Node
+from std_msgs.msg import Float64MultiArray, String
+
+from .classifier import StiffnessClassifier
+from .features import FeatureStream, believable
+
+_STATE, _CURRENT, _REFERENCE = range(3)
+_LONGEST_QUEUE = 5000
+"""Messages after which a lock-step topic that stays silent is given up and the join begins anew."""
+
+
+@dataclass(frozen=True)
+class StiffnessParameters:
+    """Parameters of the node."""
+
+    classifier: str = parameter(
+        "", "Trained classifier (.onnx, its .json beside it); empty: the one installed"
+    )
+    rate: float = parameter(30.0, "Answers per second of message time", lower=0.1, upper=1000.0, unit="Hz")
+    timeout: float = parameter(
+        0.25, "Age of current or reference from which there is no answer", lower=0.01, upper=10.0, unit="s"
+    )
+    clock: str = parameter("realtime", "How messages meet", choices=("realtime", "lockstep"))
+
+
+class StiffnessNode(Node):
+    """Classifies the grasp from the motor's signals."""
+
+    parameters = StiffnessParameters
+
+    def __init__(self) -> None:
+        super().__init__("stiffness_classifier")
+        self._settings = declare(self, StiffnessParameters)
+        self._classifier = StiffnessClassifier.load(self._settings.classifier)
+        self._stream = FeatureStream(self._classifier.spec, self._settings.rate)
+        self._codec = JointCodec([ENCODER_JOINT], effort=True)
+        self._health = Health("not_finite", "unknown_joint", "stale_input", "lost_ticks")
+        self._latest: dict[int, tuple[float, float]] = {}
+        self._currents: list[float] = []
+        self._join = TickJoin(3)
+        self._queued = 0
+        self._time = -math.inf
+        self._label = ""
+        self._probability = publisher(self, "stiffness_probability")
+        self._class = publisher(self, "stiffness_class")
+        self._text = publisher(self, "stiffness_label")
+        subscription(self, "motor_current", lambda data: self._number(_CURRENT, data))
+        subscription(self, "reference_position", lambda data: self._number(_REFERENCE, data))
+        subscription(self, "encoder_position", self._state)
+        self._diagnostics = Diagnostics(self, self._health, self._report)
+
+    def _number(self, slot: int, data: bytes) -> None:
+        value = float64_value(data)
+        if self._settings.clock == "lockstep":
+            self._tick(slot, value)
+        elif math.isfinite(value):
+            self._latest[slot] = (value, self._time)
+            if slot == _CURRENT and len(self._currents) < _LONGEST_QUEUE:
+                self._currents.append(value)
+        else:
+            self._health.count("not_finite")
+
+    def _state(self, data: bytes) -> None:
+        self._health.last_input = monotonic()
+        try:
+            sample = self._codec.decode(data)
+        except HannesError:
+            self._health.count("unknown_joint")
+            return
+        if self._settings.clock == "lockstep":
+            self._tick(_STATE, sample)
+            return
+        self._time = sample.stamp_ns * 1e-9
+        if len(self._latest) < 2:
+            return
+        (current, heard), (reference, asked) = self._latest[_CURRENT], self._latest[_REFERENCE]
+        # A value that came before the first state has no time; it counts from that state on.
+        heard, asked = (self._time if at == -math.inf else at for at in (heard, asked))
+        self._latest = {_CURRENT: (current, heard), _REFERENCE: (reference, asked)}
+        if self._currents:
+            # A current that comes oftener than the state is averaged between two states, as the sensor would.
+            rectified = self._classifier.spec.current == "rectified"
+            current = sum(map(abs, self._currents) if rectified else self._currents) / len(self._currents)
+            self._latest[_CURRENT] = (current, heard)
+            self._currents.clear()
+        if abs(self._time - min(heard, asked)) > self._settings.timeout:
+            self._health.count("stale_input")
+            return
+        self._classify(sample, current, reference)
+
+    def _tick(self, slot: int, item: JointSample | float) -> None:
+        self._join.put(slot, item)
+        self._queued += 1
+        taken = self._join.take()
+        if taken is not None:
+            self._join.synchronise()
+            self._queued = 0
+            self._classify(*taken)
+        elif self._queued > _LONGEST_QUEUE:
+            self._health.count("lost_ticks")
+            self._join.reset()
+            self._queued = 0
+
+    def _classify(self, state: JointSample, current: float, reference: float) -> None:
+        encoder = state.position[0]
+        if not believable(current, reference, encoder):
+            self._health.count("not_finite")
+            return
+        sample = self._stream.push(state.stamp_ns * 1e-9, current, reference, encoder)
+        if sample is None:
+            return
+        probability = self._classifier.probabilities([sample.values], [sample.void])[0]
+        best = int(probability.argmax())
+        self._label = STIFFNESS_CLASSES[best]
+        self._probability.publish(Float64MultiArray(data=probability.tolist()))
+        self._class.publish(float64_bytes(float(best)))
+        self._text.publish(String(data=self._label))
+        self._health.cycles += 1
+
+    def _report(self) -> tuple[bytes, str, Mapping[str, object]]:
+        values = {
+            "label": self._label,
+            "out_of_order": self._stream.rejected,
+            "restarts": self._stream.restarts,
+            "classifier_sha256": self._classifier.manifest["onnx"]["sha256"][:12],
+        }
+        if self._health.last_input is None:
+            return WARN, "waiting for motor/state", values
+        if self._settings.clock == "lockstep":
+            silent = [
+                name
+                for slot, name in enumerate(("motor/state", "motor/current", "reference_position"))
+                if slot in self._join.missing() and self._queued > 10
+            ]
+        else:
+            silent = [
+                name
+                for slot, name in ((_CURRENT, "motor/current"), (_REFERENCE, "reference_position"))
+                if slot not in self._latest or self._time - self._latest[slot][1] > self._settings.timeout
+            ]
+        return (WARN, f"no {' and no '.join(silent)}", values) if silent else (OK, "classifying", values)
+
+
+def main() -> None:
+    """Entry point of the executable `stiffness_classifier`."""
+    sys.exit(run_node("hannes_stiffness.stiffness_node:StiffnessNode"))
