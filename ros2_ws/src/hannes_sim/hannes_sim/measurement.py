@@ -103,13 +103,18 @@ def take(time: Array, values: Array, at: Array) -> Array:
 
 def logged_current(time: Array, current: Array, at: Array, *, rectified: bool, window: float) -> Array:
     """The current [A] as a logger gives it at the instants `at`: rectified, averaged over the trailing window [s]."""
-    values = np.abs(current) if rectified else current
     period = float(time[1] - time[0]) if time.size > 1 else 1.0
+    return take(time, logger(current, period, rectified=rectified, window=window), at)
+
+
+def logger(current: Array, period: float, *, rectified: bool, window: float) -> Array:
+    """What a logger would show at every tick: the current (n,) rectified and averaged over the trailing window [s]."""
+    values = np.abs(current) if rectified else current
     width = max(1, round(window / period))
     if width == 1:
-        return take(time, values, at)
+        return values
     total = np.concatenate([[0.0], np.cumsum(values)])
-    last = np.clip(np.searchsorted(time, at + 1e-9, side="right"), 1, values.size)
+    last = np.arange(1, values.size + 1)
     first = np.maximum(last - width, 0)
     return (total[last] - total[first]) / (last - first)
 

@@ -61,7 +61,6 @@ class Plant(Protocol):
     address        address of the compiled `advance(handle, voltage, steps)`
     handle         int64 addresses of the plant's buffers (ports.H_*)
     reading        float64 (N_READING,), filled by every advance
-    names          dotted parameter names that `set` takes
     """
 
     dt: float
@@ -80,6 +79,13 @@ class Plant(Protocol):
 
     def check(self) -> None:
         """Raise PlantDiverged if the last advance was not finite or not stable."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Dotted names of the parameters that `set` and `get` take."""
+
+    def get(self, name: str) -> float:
+        """The present value of a parameter."""
 
     def set(self, name: str, value: float) -> None:
         """Change one parameter (dotted name, or effect.parameter) without rebuilding."""

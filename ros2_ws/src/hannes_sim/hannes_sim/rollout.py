@@ -62,7 +62,7 @@ def _closed_loop(advance, handle, reading, control, cx, cp, cs, reference, perio
         cx[C_PERIOD] = period
         cx[C_TIME] = k * period
         voltage = call_control(control, cx_at, cp_at, cs_at)
-        for j in range(reading.shape[0]):
+        for j in range(out.shape[1]):
             out[k, j] = reading[j]
         voltages[k] = voltage
         if reading[R_WARNING] != 0.0 or not math.isfinite(voltage):
@@ -154,10 +154,12 @@ def substeps_of(period: float, dt: float) -> int:
     return steps
 
 
-def rollout(plant: Plant, controller: Controller, reference: Array, *, reset: bool = True) -> Rollout:
+def rollout(plant: Plant, controller: Controller, reference: Array, *, reset: bool = True,
+            joints: bool = True) -> Rollout:
     """Run the closed loop over a reference (n,) of one value per control period.
 
     Each tick: read, control, log, advance (the order of the lock-step node graph, which gives the same trajectory).
+    reset=False goes on from the present state; joints=False leaves the finger joints out of the log, which is faster.
     Raises PlantDiverged where the simulation does; HannesError for a reference that is not finite.
     """
     reference = np.ascontiguousarray(reference, dtype=np.float64)
@@ -171,7 +173,7 @@ def rollout(plant: Plant, controller: Controller, reference: Array, *, reset: bo
         plant.reset()
         controller.reset()
     n = reference.size
-    out = np.empty((n, N_READING))
+    out = np.empty((n, N_READING if joints else R_JOINTS))
     voltages = np.empty(n)
     done = _closed_loop(plant.address, plant.handle, plant.reading, controller.address, np.zeros(N_CONTROL_INPUTS),
                         controller.parameters, controller.states, reference, controller.period, substeps, out, voltages)

@@ -68,10 +68,11 @@ class HandSimParameters:
 class HandSim(HannesNode, Node):
     """The simulated hand: takes motor/voltage, publishes its sensors, keeps real time or waits for each command."""
 
+    node_name = "hand_sim"
     parameters = HandSimParameters
 
-    def __init__(self) -> None:
-        super().__init__("hand_sim", namespace=DEFAULT_NAMESPACE)
+    def __init__(self, cli_args: list[str] | None = None) -> None:
+        super().__init__(self.node_name, namespace=DEFAULT_NAMESPACE, cli_args=cli_args)
         self._p = p = declare(self, HandSimParameters)
         model = Model.load(p.model)
         model = model.with_plant(p.plant) if p.plant else model

@@ -1,0 +1,206 @@
+"""From signals to what the fit sees: per condition and signal the mean closure and its drift over the closures.
+
+A feature vector is linear in the signals, and the same for measurement and simulation: each closure is sampled at the
+measured instants, interpolated onto a phase grid, and combined over the closures.  The simulation of a model without
+memory repeats itself from the second closure of a condition on, so only two closures are simulated and the rest is
+taken from the second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from hannes_description.errors import HannesError
+from hannes_description.model import Model
+from hannes_sim.effect import load_effect
+from numpy.typing import NDArray
+
+from .rig import Rig
+from .trials import Trial
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+MAX_PHASES = 160
+"""Points of the phase grid of one closure at most."""
+
+MIN_CLOSURES_FOR_DRIFT = 4
+
+
+@dataclass(frozen=True)
+class Block:
+    """One signal of one condition of one trial.
+
+    phase      (p,) s since the closure's start
+    measured   (n, p) the closures on the phase grid
+    before, after, weight   (n, p) samples [ticks of the simulation] and interpolation weight of each point
+    compact    the same three for a simulation of the first two closures only; None where that does not hold
+    """
+
+    trial: int
+    condition: str
+    signal: str
+    phase: Array
+    measured: Array
+    full: tuple[Index, Index, Array]
+    compact: tuple[Index, Index, Array] | None
+
+    @property
+    def n(self) -> int:
+        return int(self.measured.shape[0])
+
+    @property
+    def size(self) -> int:
+        """Number of features: the mean closure, and its drift if there are enough closures."""
+        return self.phase.size * (2 if self.n >= MIN_CLOSURES_FOR_DRIFT else 1)
+
+    def combine(self, closures: Array) -> Array:
+        """Features (size,) of closures (n, p): the mean, then the change from the first to the last (linear trend)."""
+        mean = closures.mean(axis=0)
+        if self.n < MIN_CLOSURES_FOR_DRIFT:
+            return mean
+        ramp = np.linspace(-0.5, 0.5, self.n)
+        return np.concatenate([mean, ramp @ (closures - mean) / (ramp @ ramp)])
+
+    def predicted(self, ticks: Array, compact: bool) -> Array:
+        """Closures (n, p) from a simulated signal on the control grid."""
+        before, after, weight = self.compact if compact and self.compact is not None else self.full
+        return ticks[before] * (1.0 - weight) + ticks[after] * weight
+
+
+@dataclass(frozen=True)
+class Features:
+    """The operator from trials to features; build it once per data set.
+
+    blocks         one per trial, condition and signal
+    ends           per trial, ticks that a compact simulation needs (None: it must be simulated whole)
+    """
+
+    trials: tuple[Trial, ...]
+    blocks: tuple[Block, ...]
+    ends: tuple[int | None, ...]
+    slices: tuple[slice, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        at, slices = 0, []
+        for block in self.blocks:
+            slices.append(slice(at, at + block.size))
+            at += block.size
+        object.__setattr__(self, "slices", tuple(slices))
+
+    @property
+    def size(self) -> int:
+        return self.slices[-1].stop if self.slices else 0
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(block.condition for block in self.blocks))
+
+    @property
+    def measured(self) -> Array:
+        """Features of the measurement (size,)."""
+        return np.concatenate([block.combine(block.measured) for block in self.blocks])
+
+    def rows(self, condition: str) -> NDArray[np.bool_]:
+        """Which features belong to a condition."""
+        out = np.zeros(self.size, dtype=bool)
+        for block, rows in zip(self.blocks, self.slices, strict=True):
+            out[rows] = block.condition == condition
+        return out
+
+    def closures(self, rig: Rig, model: Model, values: Mapping[str, float]) -> list[Array]:
+        """Predicted closures (n, p) of every block."""
+        memory = any(load_effect(effect.source or effect.name).memory for effect in model.effects)
+        runs: list[tuple[Mapping[str, Array], bool]] = []
+        for trial, end in zip(self.trials, self.ends, strict=True):
+            compact = end is not None and not memory
+            reference = trial.reference[:end] if compact else trial.reference
+            runs.append((rig.simulate(model, values, trial, reference), compact))
+        return [block.predicted(runs[block.trial][0][block.signal], runs[block.trial][1]) for block in self.blocks]
+
+    def predict(self, rig: Rig, model: Model, values: Mapping[str, float]) -> Array:
+        """Features of the model (size,)."""
+        closures = self.closures(rig, model, values)
+        return np.concatenate([b.combine(c) for b, c in zip(self.blocks, closures, strict=True)])
+
+
+def build_features(trials: Sequence[Trial], signals: Sequence[str]) -> Features:
+    """The operator for these trials and signals.
+
+    Raises HannesError where no trial has any of the signals.
+    """
+    blocks: list[Block] = []
+    ends: list[int | None] = []
+    for number, trial in enumerate(trials):
+        end = _compact_end(trial)
+        ends.append(end)
+        for condition in trial.conditions:
+            for signal in signals:
+                if signal in trial.signals:
+                    block = _block(trial, number, condition, signal, end is not None)
+                    if block is not None:
+                        blocks.append(block)
+    if not blocks:
+        raise HannesError(f"None of the signals {', '.join(signals)} covers a whole closure in these recordings.")
+    return Features(tuple(trials), tuple(blocks), tuple(ends))
+
+
+def _compact_end(trial: Trial) -> int | None:
+    """Ticks up to the end of the second closure, if all closures of the trial have the same reference."""
+    if len(trial.conditions) != 1 or len(trial.closures) < 3:
+        return None
+    second = trial.closures[1]
+    n = round((second.stop - second.start) / trial.period)
+    a = round(second.start / trial.period)
+    shape = trial.reference[a:a + n]
+    span = float(np.ptp(shape)) or 1.0
+    for closure in trial.closures[2:]:
+        k = round(closure.start / trial.period)
+        other = trial.reference[k:k + n]
+        # A fresh reference sample may fall one tick earlier or later from closure to closure.
+        if other.size < n or np.mean(np.abs(other - shape)) > 2e-3 * span:
+            return None
+    return min(trial.reference.size, round(second.stop / trial.period) + 60)
+
+
+def _block(trial: Trial, number: int, condition: str, signal: str, may_compact: bool) -> Block | None:
+    time, values = trial.signals[signal]
+    closures = trial.of(condition)
+    length = min(c.stop - c.start for c in closures)
+    step = float(np.median(np.diff(time))) if time.size > 1 else length
+    points = int(min(MAX_PHASES, max(8, round(length / step))))
+    phase = (np.arange(points) + 0.5) * (length - step) / points
+    ticks = trial.reference.size
+    sample_tick = np.clip(np.floor(time / trial.period + 1e-4).astype(np.int64), 0, ticks - 1)
+    full: list[tuple[Index, Index, Array]] = []
+    compact: list[tuple[Index, Index, Array]] = []
+    measured = []
+    base = trial.closures[1] if may_compact else None
+    limit = _compact_end(trial) if may_compact else None
+    for closure in closures:
+        at = closure.start + phase
+        right = np.searchsorted(time, at)
+        if right[0] == 0 or right[-1] >= time.size:
+            inside = (at >= time[0] - step) & (at <= time[-1] + step)
+            if not inside.all():
+                continue
+            right = np.clip(right, 1, time.size - 1)
+        left = right - 1
+        weight = np.clip((at - time[left]) / np.maximum(time[right] - time[left], 1e-12), 0.0, 1.0)
+        measured.append(values[left] * (1.0 - weight) + values[right] * weight)
+        full.append((sample_tick[left], sample_tick[right], weight))
+        if base is not None and limit is not None:
+            shift = 0 if closure is trial.closures[0] else round((base.start - closure.start) / trial.period)
+            compact.append((np.clip(sample_tick[left] + shift, 0, limit - 1),
+                            np.clip(sample_tick[right] + shift, 0, limit - 1), weight))
+    if not measured:
+        return None
+
+    def stack(parts: list[tuple[Index, Index, Array]]) -> tuple[Index, Index, Array]:
+        a, b, w = zip(*parts, strict=True)
+        return np.array(a), np.array(b), np.array(w)
+
+    return Block(number, condition, signal, phase, np.array(measured), stack(full),
+                 stack(compact) if compact else None)

@@ -1,0 +1,220 @@
+"""The statistical problem: whitened residuals between a model and a data set, with what repeats tell about the noise.
+
+The mean of n closures is uncertain by the noise of the sensors and by the scatter from closure to closure.  The scatter
+moves whole curves, not single samples: it is expressed in the simulator's own parameters (friction, object place,
+encoder zero ...), whose sensitivities are known, so that 13 closures are enough to estimate it.
+
+    C_c = (diag(v) + J_c S J_c^T) / n        per condition c; v smoothed sample variance, S = diag(scatter variances)
+
+Whitened residual: L_c^{-1} (measured - predicted), C_c = L_c L_c^T.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from hannes_description.model import EffectEntry, Model
+from hannes_sim.effect import EffectType, load_effect
+from hannes_sim.plant import PlantDiverged
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from .features import Features
+from .rig import Nuisance, Rig
+
+Array = NDArray[np.float64]
+
+FLOOR = 2e-4
+"""Smallest standard deviation of a sample, relative to the span of its signal: what replay of a logged reference and a
+plant of finite step can promise."""
+
+FAILED = 1e3
+"""Whitened residual of a simulation that diverged: a large finite penalty."""
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One dimension of the search: maps z to a parameter's value.
+
+    prior    True for a nuisance parameter with a standard normal prior on z
+    scale    value = offset + scale z, or offset exp(scale z) if log
+    """
+
+    name: str
+    offset: float
+    scale: float
+    log: bool
+    lower: float
+    upper: float
+    prior: bool
+    step: float
+    unit: str = ""
+
+    def value(self, z: float) -> float:
+        raw = self.offset * float(np.exp(self.scale * z)) if self.log else self.offset + self.scale * z
+        return min(max(raw, self.lower), self.upper)
+
+    def z(self, value: float) -> float:
+        return float(np.log(value / self.offset)) / self.scale if self.log else (value - self.offset) / self.scale
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        low = -np.inf if not np.isfinite(self.lower) or (self.log and self.lower <= 0.0) else self.z(self.lower)
+        high = np.inf if not np.isfinite(self.upper) else self.z(self.upper)
+        return low, high
+
+
+def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
+    """z in standard deviations of the prior; a step of half of one is well above the simulation's own roughness."""
+    return Coordinate(nuisance.name, nuisance.mean, nuisance.sd, nuisance.log, -np.inf, np.inf, True, 0.5, nuisance.unit)
+
+
+def effect_coordinates(effect: EffectType) -> list[Coordinate]:
+    """z in units of the typical value; positive shape parameters on a logarithmic scale."""
+    out = []
+    for p in effect.parameters:
+        if p.vanishing is None and p.lower > 0.0:
+            out.append(Coordinate(f"{effect.name}.{p.name}", p.typical, 1.0, True, p.lower, p.upper, False, 0.03, p.unit))
+        else:
+            away = p.vanishing or 0.0
+            scale = abs(p.typical - away) or 0.05 * (p.upper - p.lower)
+            out.append(Coordinate(f"{effect.name}.{p.name}", away, scale, False, p.lower, p.upper, False, 0.03, p.unit))
+    return out
+
+
+def vanishing_entry(effect: EffectType, source: str | None, shape: Mapping[str, float] | None = None) -> EffectEntry:
+    """The effect switched off, in a model in which its parameters can then be moved."""
+    values = {p.name: p.vanishing if p.vanishing is not None else (shape or {}).get(p.name, p.typical)
+              for p in effect.parameters}
+    return effect.entry(values, source=source)
+
+
+@dataclass
+class Problem:
+    """Data, noise and rig of one data set; counts its simulations.
+
+    rows      features that take part (held-out conditions are left out)
+    """
+
+    rig: Rig
+    features: Features
+    whitener: tuple[tuple[NDArray[np.int64], Array], ...]
+    simulations: int = 0
+    failures: int = 0
+    _measured: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._measured = self.features.measured
+
+    def whiten(self, difference: Array) -> Array:
+        """L^{-1} difference, for a vector (size,) or columns (size, k)."""
+        out = np.empty_like(difference)
+        for rows, lower in self.whitener:
+            out[rows] = solve_triangular(lower, difference[rows], lower=True)
+        return out
+
+    def residual(self, model: Model, values: Mapping[str, float]) -> Array:
+        """Whitened (measured - predicted), (size,); FAILED where the simulation diverges."""
+        self.simulations += 1
+        try:
+            predicted = self.features.predict(self.rig, model, values)
+        except PlantDiverged:
+            self.failures += 1
+            return np.full(self._measured.size, FAILED)
+        return self.whiten(self._measured - predicted)
+
+
+def build_problem(rig: Rig, features: Features, model: Model, nuisances: Sequence[Nuisance],
+                  values: Mapping[str, float]) -> Problem:
+    """Estimate noise and scatter from the repeats, with sensitivities taken at `values` of `model`.
+
+    Where a condition has a single closure its scatter is that of the priors (closure_sd), and its sample variance is
+    taken from the roughness of the curve.
+    """
+    deviations = [block.measured - block.measured.mean(axis=0) for block in features.blocks]
+    variances = []
+    for block, e in zip(features.blocks, deviations, strict=True):
+        span = float(np.ptp(block.measured)) or 1.0
+        floor = (FLOOR * span) ** 2
+        variances.append(_sample_variance(block.measured, e) + floor)
+    base = features.closures(rig, model, values)
+    columns: list[list[Array]] = []
+    scatter_names = [n for n in nuisances if n.closure_sd > 0.0]
+    for nuisance in scatter_names:
+        c = nuisance_coordinate(nuisance)
+        here = c.z(values.get(nuisance.name, nuisance.mean))
+        moved = features.closures(rig, model, {**values, nuisance.name: c.value(here + c.step)})
+        # sensitivity to one standard deviation of the closure-to-closure scatter
+        factor = nuisance.closure_sd / nuisance.sd / c.step
+        columns.append([(m - b).mean(axis=0) * factor for m, b in zip(moved, base, strict=True)])
+
+    whitener = []
+    for condition in features.conditions:
+        own = [k for k, block in enumerate(features.blocks) if block.condition == condition]
+        n = features.blocks[own[0]].n
+        v = np.concatenate([variances[k] for k in own])
+        jacobian = (np.column_stack([np.concatenate([column[k] for k in own]) for column in columns])
+                    if columns else np.zeros((v.size, 0)))
+        power = np.ones(jacobian.shape[1])
+        if n >= 3 and jacobian.shape[1] and len({features.blocks[k].n for k in own}) == 1:
+            e = np.concatenate([deviations[k] for k in own], axis=1)
+            power, v = _estimate_scatter(e, jacobian, v)
+        single = np.diag(v) + (jacobian * power) @ jacobian.T
+        for part, count in _parts(features, own, n):
+            rows = np.concatenate([np.arange(features.slices[k].start + a, features.slices[k].start + b)
+                                   for k, a, b in part])
+            if rows.size:
+                whitener.append((rows, np.linalg.cholesky(single / count)))
+    return Problem(rig, features, tuple(whitener))
+
+
+def _parts(features: Features, own: Sequence[int], n: int) -> list[tuple[list[tuple[int, int, int]], float]]:
+    """Mean and drift parts of a condition's blocks, each with the count that divides the covariance of one closure."""
+    mean = [(k, 0, features.blocks[k].phase.size) for k in own]
+    parts: list[tuple[list[tuple[int, int, int]], float]] = [(mean, float(n))]
+    drift = [(k, features.blocks[k].phase.size, features.blocks[k].size) for k in own
+             if features.blocks[k].size > features.blocks[k].phase.size]
+    if len(drift) == len(own):
+        ramp = np.linspace(-0.5, 0.5, n)
+        parts.append((drift, float(ramp @ ramp)))
+    return parts
+
+
+def _smooth(values: Array, width: int = 9) -> Array:
+    """Moving average with shrinking windows at the ends."""
+    width = min(width, values.size)
+    kernel = np.ones(width)
+    norm: Array = np.convolve(np.ones(values.size), kernel, mode="same")
+    out: Array = np.convolve(values, kernel, mode="same") / norm
+    return out
+
+
+def _sample_variance(measured: Array, deviations: Array) -> Array:
+    """Variance of one sample along the phase (p,), smoothed."""
+    n = measured.shape[0]
+    if n >= 3:
+        return _smooth((deviations**2).sum(axis=0) / (n - 1))
+    # One or two closures: the second difference of a smooth curve is mostly noise (variance factor 6).
+    second = np.diff(measured.mean(axis=0), 2)
+    robust = (np.median(np.abs(second)) / 0.6745) ** 2 / 6.0 * n
+    return np.full(measured.shape[1], robust)
+
+
+def _estimate_scatter(deviations: Array, jacobian: Array, variance: Array) -> tuple[Array, Array]:
+    """Power of each scatter direction, relative to its prior, and the sample variance (p,) that it leaves.
+
+    Each closure's deviation (n, p) is explained by ridge regression on the sensitivities; the mean square of the
+    coefficients, shrunk towards the prior (1) with the weight of three closures, is the power.
+    """
+    n = deviations.shape[0]
+    weighted = jacobian / variance[:, None]
+    gram = jacobian.T @ weighted + np.eye(jacobian.shape[1])
+    coefficients = np.linalg.solve(gram, weighted.T @ deviations.T)
+    spread = np.diag(np.linalg.inv(gram))
+    power = (coefficients**2).sum(axis=1) / (n - 1) + spread
+    power = (power * (n - 1) + 3.0) / (n + 2.0)
+    rest = deviations - (jacobian @ coefficients).T
+    left = _smooth((rest**2).sum(axis=0) / (n - 1))
+    return power, np.clip(left, 0.05 * variance, variance)

@@ -1,0 +1,234 @@
+"""From recordings to trials: the reference on the control grid, the closures, and which of them repeat one condition.
+
+Nothing here knows that the machine is a hand: a closure is a stretch in which the reference leaves its rest value and
+comes back; another machine's adapter may give its own stretches.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from hannes_bags.recording import Recording
+from hannes_description.errors import HannesError
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SIGNALS = ("encoder_position", "motor_current", "motor_voltage", "grip_force")
+"""Signals that are compared, in this order, as far as a recording has them."""
+
+ZERO_ORDER_HOLD_RATE = 90.0
+"""Hz; a reference logged at least this fast is what the controller received, message by message; a slower log has
+gaps that are filled by a smooth curve."""
+
+
+@dataclass(frozen=True)
+class Closure:
+    """One repetition: start and stop [s] in the trial's time, and the condition that it repeats."""
+
+    start: float
+    stop: float
+    condition: str
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One recording, ready to be replayed.
+
+    reference  (n,) on the control grid: reference[k] acts from k x period on
+    signals    name -> (time (m,) s, values (m,))
+    options    what the plant must know of this recording (object, sensors, pose); the rig's adapter reads it
+    """
+
+    name: str
+    period: float
+    reference: Array
+    signals: Mapping[str, tuple[Array, Array]]
+    closures: tuple[Closure, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    source: str = ""
+    sha256: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.reference.ndim != 1 or self.reference.size < 2:
+            raise HannesError(f"Trial '{self.name}': the reference is too short to be replayed.")
+        if not self.closures:
+            raise HannesError(f"Trial '{self.name}': no closure was found: the reference never leaves its rest value "
+                              "and comes back. Record at least one whole closure.")
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Names of the conditions, in the order of their first closure."""
+        return tuple(dict.fromkeys(closure.condition for closure in self.closures))
+
+    def of(self, condition: str) -> tuple[Closure, ...]:
+        return tuple(closure for closure in self.closures if closure.condition == condition)
+
+    def only(self, closures: Sequence[Closure]) -> Trial:
+        """The same recording with a part of its closures."""
+        return replace(self, closures=tuple(closures))
+
+
+def reference_on_grid(time: Array, values: Array, period: float, duration: float) -> tuple[Array, str | None]:
+    """The reference [n] on the control grid, and a note where it had to be guessed between samples.
+
+    Fast logs are held from message to message, as the controller does.  Slow logs are interpolated by a monotone cubic;
+    where the reference leaves or reaches its rest value between two samples, the moving part is extrapolated to it.
+    """
+    grid = np.arange(max(2, math.floor(duration / period + 1e-6) + 1)) * period
+    step = float(np.median(np.diff(time))) if time.size > 1 else period
+    if time.size < 4 or 1.0 / step >= ZERO_ORDER_HOLD_RATE:
+        index = np.clip(np.searchsorted(time, grid + 1e-7, side="right") - 1, 0, time.size - 1)
+        return values[index], None
+    from scipy.interpolate import PchipInterpolator
+
+    out = np.interp(grid, time, values)
+    rest = _rest_value(values)
+    span = float(np.ptp(values)) or 1.0
+    moving = np.abs(values - rest) > 1e-9 * span
+    for first, last in _runs(moving):
+        t, v = time[first:last + 1], values[first:last + 1]
+        if t.size < 4:
+            continue
+        curve = PchipInterpolator(t, v, extrapolate=True)
+        left, right = t[0], t[-1]
+        if first > 0:
+            slope = (v[1] - v[0]) / (t[1] - t[0])
+            left = max(time[first - 1], t[0] - (v[0] - rest) / slope) if slope * (v[0] - rest) > 0 else time[first - 1]
+        if last < time.size - 1:
+            slope = (v[-1] - v[-2]) / (t[-1] - t[-2])
+            right = min(time[last + 1], t[-1] + (v[-1] - rest) / -slope) if slope * (v[-1] - rest) < 0 \
+                else time[last + 1]
+        inside = (grid >= t[0]) & (grid <= t[-1])
+        out[inside] = curve(grid[inside])
+        if first > 0:
+            edge = (grid > time[first - 1]) & (grid < t[0])
+            out[edge] = np.interp(grid[edge], [left, t[0]], [rest, v[0]])
+        if last < time.size - 1:
+            edge = (grid > t[-1]) & (grid < time[last + 1])
+            out[edge] = np.interp(grid[edge], [t[-1], right], [v[-1], rest])
+    return out, f"the reference is logged at {1.0 / step:.0f} Hz; between samples it is interpolated"
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last index of every run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _rest_value(values: Array) -> float:
+    """The value at which the reference rests: the most frequent one, or the minimum of a reference that never rests."""
+    rounded, counts = np.unique(np.round(values, 6), return_counts=True)
+    return float(rounded[np.argmax(counts)]) if counts.max() >= 0.05 * values.size else float(values.min())
+
+
+def find_closures(reference: Array, period: float, *, lead: float = 0.03) -> list[tuple[float, float]]:
+    """Start and stop [s] of every stretch from one departure of the reference to the next.
+
+    A closure starts `lead` seconds before the reference has moved by 2 % of its span and lasts until the next one
+    starts (the rest after it belongs to it: the hand is still opening), at most as long again as its moving part.
+    """
+    span = float(np.ptp(reference))
+    if span <= 0.0:
+        return []
+    moving = np.abs(reference - _rest_value(reference)) > 0.02 * span
+    starts = [(first * period, last * period) for first, last in _runs(moving) if last - first >= 3]
+    out = []
+    for k, (first, last) in enumerate(starts):
+        begin = first - lead
+        end = starts[k + 1][0] - lead if k + 1 < len(starts) else (reference.size - 1) * period
+        out.append((begin, min(end, last + (last - first))))
+    return out
+
+
+def group_closures(reference: Array, period: float, spans: Iterable[tuple[float, float]], name: str) -> list[Closure]:
+    """Closures whose reference is the same (within 3 % of its span, and 3 % of its length) share a condition.
+
+    Cut-off closures (less than 80 % of the usual length of their condition) are dropped.
+    """
+    kinds: list[tuple[Array, float]] = []
+    members: list[tuple[float, float, int]] = []
+    for start, stop in spans:
+        shape = reference[np.clip(np.arange(round(start / period), round(stop / period) + 1), 0, reference.size - 1)]
+        span = float(np.ptp(shape)) or 1.0
+        for index, (other, length) in enumerate(kinds):
+            n = min(shape.size, other.size)
+            alike = n >= 0.3 * other.size and float(np.max(np.abs(shape[:n] - other[:n]))) <= 0.03 * span + 1e-9
+            longer = max(shape.size, other.size) * period
+            if alike and (abs((stop - start) - length) <= 0.03 * length or n * period < longer):
+                members.append((start, stop, index))
+                break
+        else:
+            members.append((start, stop, len(kinds)))
+            kinds.append((shape, stop - start))
+    out = []
+    for index in range(len(kinds)):
+        own = [(a, b) for a, b, i in members if i == index]
+        usual = float(np.median([b - a for a, b in own]))
+        label = name if len(kinds) == 1 else f"{name}.{index + 1}"
+        out += [Closure(a, min(b, a + usual), label) for a, b in own if b - a >= 0.8 * usual]
+    return sorted(out, key=lambda closure: closure.start)
+
+
+def make_trial(recording: Recording, *, name: str | None = None, period: float = 1e-3,
+               signals: Sequence[str] = SIGNALS) -> Trial:
+    """A trial from a recording; the condition's name and options come from its metadata where it has them.
+
+    Raises HannesError where the recording has no reference or none of the signals.
+    """
+    recording.require(["reference_position"])
+    present = [s for s in signals if s in recording.channels]
+    if "motor_current" not in present and "motor_effort" in recording.channels:
+        present.append("motor_effort")
+    if not present:
+        raise HannesError(f"{recording.source}: none of the signals {', '.join(signals)} is recorded; nothing can be "
+                          "compared.")
+    notes = list(recording.warnings)
+    meta = recording.metadata
+    name = name or str(meta.get("condition") or _stem(recording.source))
+    channel = recording["reference_position"]
+    origin = float(channel.time[0])
+    origin = math.floor(origin / period + 1e-6) * period
+    duration = max(float(recording[s].time[-1]) for s in ("reference_position", *present)) - origin
+    reference, note = reference_on_grid(channel.time - origin, np.asarray(channel.values, dtype=float), period, duration)
+    if note:
+        notes.append(note)
+    samples = {s: (np.asarray(recording[s].time) - origin, np.asarray(recording[s].values, dtype=float))
+               for s in present}
+    begin = max(float(t[0]) for t, _ in samples.values())
+    end = min(float(t[-1]) for t, _ in samples.values())
+    spans = find_closures(reference, period)
+    whole = [(a, min(b, end)) for a, b in spans if a >= begin - 0.1 and b > a]
+    closures = group_closures(reference, period, whole, name)
+    if spans and len(closures) < len(spans):
+        notes.append(f"{len(spans) - len(closures)} of {len(spans)} closures are cut off and left out")
+    options = {key: meta[key] for key in ("object", "sensors", "pose", "encoder_session") if key in meta}
+    return Trial(name, period, reference, samples, tuple(closures), options, recording.source, recording.sha256,
+                 tuple(notes))
+
+
+def _stem(source: str) -> str:
+    from pathlib import Path
+
+    path = Path(source)
+    return (path.stem if path.suffix else path.name) or "recording"
+
+
+def unique_names(trials: Sequence[Trial]) -> list[Trial]:
+    """Conditions of different recordings get different names."""
+    taken: dict[str, int] = {}
+    out = []
+    for trial in trials:
+        count = taken.get(trial.name, 0)
+        taken[trial.name] = count + 1
+        if count:
+            new = f"{trial.name}#{count + 1}"
+            closures = tuple(replace(c, condition=c.condition.replace(trial.name, new, 1)) for c in trial.closures)
+            trial = replace(trial, name=new, closures=closures)
+        out.append(trial)
+    return out
