@@ -54,10 +54,11 @@ class MotorControllerParameters:
 class MotorController(HannesNode, LifecycleNode):
     """Drives the motor to the reference position; commands only while active."""
 
+    node_name = "motor_controller"
     parameters = MotorControllerParameters
 
-    def __init__(self) -> None:
-        super().__init__("motor_controller", namespace=DEFAULT_NAMESPACE)
+    def __init__(self, cli_args: list[str] | None = None) -> None:
+        super().__init__(self.node_name, namespace=DEFAULT_NAMESPACE, cli_args=cli_args)
         self._p = p = declare(self, MotorControllerParameters)
         model = Model.load(p.model)
         if model.controller != "double_pid":

@@ -15,12 +15,16 @@ CLOCK_HELP: Final = "realtime runs by the clock of the machine, lockstep waits f
 
 
 class HannesNode:
-    """Mixin of Node or LifecycleNode.
+    """Mixin of Node or LifecycleNode; the class is called with the arguments for this node alone (`run.run_node`).
 
+    node_name   the node's name unless it is remapped
+    parameters  dataclass of its parameters
     done     the work is finished: the process ends with exit code 0
     failure  why it cannot go on: printed in one line, exit code 2
     """
 
+    node_name: str
+    parameters: type
     create_timer: Any
     done = False
     failure: str | None = None
@@ -28,6 +32,9 @@ class HannesNode:
     def fail(self, error: object) -> None:
         """End the process with this error."""
         self.failure, self.done = str(error), True
+
+    def stop(self) -> None:
+        """Put away what runs besides the executor; called once, before the node is destroyed."""
 
     def wall_timer(self, period: float, callback: Callable[[], None]) -> Timer:
         """A timer of `period` s of wall time, even while simulated time stands still."""

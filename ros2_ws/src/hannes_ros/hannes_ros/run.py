@@ -29,8 +29,9 @@ def run_node(*names: str, executor: str = "events", argv: Sequence[str] | None =
 
     names     "package.module:Class" of each node; imported here, after signals are safe
     executor  "events" (fast) or "single" (the ordinary single-threaded one)
-    A node may have `parameters` (a dataclass class, for --help), `done` (true ends the process) and `stop()`
-    (called before it is destroyed). 0 after SIGINT, SIGTERM or the end of the work, 2 after a HannesError.
+    Each class is called with `cli_args` and has `node_name` and `parameters` (a dataclass, for --help); its nodes have
+    `done` (true ends the process), `failure` (why) and `stop()` (called before it is destroyed).
+    0 after SIGINT, SIGTERM or the end of the work, 2 after a HannesError or a failure.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _leave_at_once)
@@ -59,24 +60,24 @@ def _run(names: Sequence[str], executor: str, arguments: list[str]) -> int:
         return 0
     import rclpy
 
+    arguments, local = _node_rules(arguments, [cls.node_name for cls in classes])
     context = _init(arguments)
     nodes: list[Any] = []
     try:
         spinner = _executor(executor, context)
         for cls in classes:
-            nodes.append(_create(cls))
+            nodes.append(_create(cls, local[cls.node_name]))
             spinner.add_node(nodes[-1])
         stop = _StopOnSignal()
-        while context.ok() and not stop.asked and not any(getattr(node, "done", False) for node in nodes):
+        while context.ok() and not stop.asked and not any(node.done for node in nodes):
             spinner.spin_once(_SPIN_S)
     finally:
         for node in reversed(nodes):
-            if hasattr(node, "stop"):
-                node.stop()
+            node.stop()
         for node in reversed(nodes):
             node.destroy_node()
         rclpy.try_shutdown(context=context)
-    failures = [node.failure for node in nodes if getattr(node, "failure", None)]
+    failures = [node.failure for node in nodes if node.failure]
     if failures:
         raise HannesError(str(failures[0]))
     return 0
@@ -110,12 +111,37 @@ def _init(arguments: list[str]) -> Context:
     return get_default_context()
 
 
-def _create(cls: Any) -> Node:
+def _node_rules(arguments: list[str], names: Sequence[str]) -> tuple[list[str], dict[str, list[str]]]:
+    """Take `-p node:name:=value` out of the arguments, as arguments of that node alone.
+
+    rcl compares `node` with the fully qualified name, which its command line cannot express for a node in a
+    namespace, and ignores the rule without a word when it does not fit.
+    """
+    rest: list[str] = []
+    local: dict[str, list[str]] = {name: [] for name in names}
+    position = 0
+    while position < len(arguments):
+        argument = arguments[position]
+        rule = arguments[position + 1] if argument in ("-p", "--param") and position + 1 < len(arguments) else ""
+        node, colon, parameter = rule.partition(":=")[0].partition(":")
+        if colon and "/" not in node:
+            if node not in local:
+                raise HannesError(f"There is no node '{node}' in this process ('{argument} {rule}'); there "
+                                  f"is {', '.join(names)}.")
+            local[node] += ["--ros-args", "-p", parameter + rule[rule.index(":="):], "--"]
+            position += 2
+        else:
+            rest.append(argument)
+            position += 1
+    return rest, local
+
+
+def _create(cls: Any, cli_args: list[str]) -> Node:
     from rclpy.exceptions import NameValidationException
     from rclpy.impl.implementation_singleton import rclpy_implementation
 
     try:
-        node: Node = cls()
+        node: Node = cls(cli_args)
         return node
     except (rclpy_implementation.RCLError, NameValidationException) as error:
         raise HannesError(f"The node cannot start: {_first_line(error)}") from None
@@ -143,4 +169,4 @@ def _help(program: str, classes: Sequence[Any]) -> None:
     print(f"usage: {program} [--ros-args -p name:=value -r old:=new --params-file FILE.yaml ...]")
     for cls in classes:
         title = (cls.__doc__ or "").strip().split("\n")[0]
-        print(f"\n{cls.__name__}: {title}\n{help_text(cls.parameters) if hasattr(cls, 'parameters') else ''}")
+        print(f"\n{cls.node_name}: {title}\n{help_text(cls.parameters)}")

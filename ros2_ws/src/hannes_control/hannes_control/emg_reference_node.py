@@ -1,0 +1,158 @@
+"""emg_reference: two EMG channels in, the reference of the encoder position out."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections import deque
+from dataclasses import dataclass
+from time import monotonic
+
+from hannes_description.errors import HannesError
+from hannes_ros import convert, topics
+from hannes_ros.diagnostics import OK, WARN, Diagnostics, Health
+from hannes_ros.lockstep import Peers, samples_until
+from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
+from hannes_ros.node_parameters import declare, parameter
+from hannes_ros.run import run_node
+from rclpy.node import Node
+
+from .emg import EmgIntegrator, EmgParameters
+
+_CHECK_S = 0.02
+_DEFAULT = EmgParameters()
+
+
+@dataclass(frozen=True)
+class EmgReferenceParameters:
+    """ROS parameters of emg_reference; see EmgParameters for their meaning."""
+
+    clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
+    rate: int = parameter(int(_DEFAULT.rate), "rate of both channels", lower=100, upper=2000, unit="Hz")
+    full_scale: float = parameter(_DEFAULT.full_scale, "envelope of a full contraction; thresholds are fractions of it",
+                                  lower=1e-9, upper=1e6, unit="V")
+    envelope_cutoff: float = parameter(_DEFAULT.envelope_cutoff, "low-pass of the rectified signal", lower=0.1,
+                                       upper=45.0, unit="Hz")
+    dead_band: float = parameter(_DEFAULT.dead_band, "envelope of zero speed", lower=0.0, upper=1.0)
+    close_threshold: float = parameter(_DEFAULT.close_threshold, "flexor envelope that closes", lower=0.0, upper=10.0)
+    open_threshold: float = parameter(_DEFAULT.open_threshold, "extensor envelope that opens", lower=0.0, upper=10.0)
+    speed: float = parameter(_DEFAULT.speed, "speed of a full contraction", lower=1e-3, upper=1e3, unit="rad/s")
+    max_speed: float = parameter(_DEFAULT.max_speed, "limit of the speed", lower=1e-3, upper=1e3, unit="rad/s")
+    max_position: float = parameter(_DEFAULT.max_position, "largest reference", lower=1e-3, upper=100.0, unit="rad")
+    cocontraction_threshold: float = parameter(_DEFAULT.cocontraction_threshold,
+                                               "both envelopes above it: a switch event, no movement", lower=0.0,
+                                               upper=10.0)
+    cocontraction_time: float = parameter(_DEFAULT.cocontraction_time, "how long both must stay above it", lower=0.0,
+                                          upper=10.0, unit="s")
+
+    def emg(self) -> EmgParameters:
+        """The same values as the core takes them."""
+        return EmgParameters(**{name: getattr(self, name) for name in EmgParameters.__dataclass_fields__})
+
+
+class EmgReferenceNode(HannesNode, Node):
+    """Turns muscle signals into a position reference; in lock-step exactly one for each motor/state."""
+
+    node_name = "emg_reference"
+    parameters = EmgReferenceParameters
+
+    def __init__(self, cli_args: list[str] | None = None) -> None:
+        super().__init__(self.node_name, namespace=DEFAULT_NAMESPACE, cli_args=cli_args)
+        self._p = p = declare(self, EmgReferenceParameters)
+        self._emg = EmgIntegrator(p.emg())
+        self._channels: tuple[deque[float], deque[float]] = (deque(), deque())
+        self._held = [0.0, 0.0]
+        self._taken = 0
+        self._stamp = -1
+        self._ticks: deque[int] = deque()
+        self._switches = 0
+        self._health = Health("rejected_samples", "rejected_states")
+        self._reference = topics.publisher(self, "reference_position")
+        self._lockstep = p.clock == "lockstep"
+        self._peers = Peers({"a subscriber of reference_position": (self._reference.get_subscription_count, 1)})
+        for number, name in enumerate(("emg_flexor", "emg_extensor")):
+            topics.subscription(self, name, lambda data, number=number: self._on_emg(number, data))
+        if self._lockstep:
+            topics.subscription(self, "encoder_position", self._on_tick_state)
+            self.wall_timer(_CHECK_S, self._check)
+        self._diagnostics = Diagnostics(self, self._health, self._status)
+
+    def _on_emg(self, number: int, data: bytes) -> None:
+        value = convert.float64_value(data)
+        if math.isfinite(value):
+            self._held[number] = value
+        else:
+            self._health.count("rejected_samples")
+        self._channels[number].append(self._held[number])
+        self._health.last_input = monotonic()
+        if self._lockstep:
+            self._answer()
+        elif all(self._channels):
+            self._take()
+            self._publish()
+
+    def _take(self) -> None:
+        """One sample of both channels."""
+        flexor, extensor = self._channels
+        self._emg.update(flexor.popleft(), extensor.popleft())
+        self._taken += 1
+        if self._emg.switches > self._switches:
+            self._switches = self._emg.switches
+            self.get_logger().info(f"co-contraction: switch event {self._switches}")
+
+    def _publish(self) -> None:
+        self._reference.publish(convert.float64_bytes(self._emg.reference))
+        self._health.cycles += 1
+
+    # -- lock-step ---------------------------------------------------------------------------------------------------
+    def _on_tick_state(self, data: bytes) -> None:
+        try:
+            stamp_ns = convert.MOTOR_STATE.decode(data).stamp_ns
+        except HannesError as error:
+            self._health.count("rejected_states")
+            self.get_logger().error(f"motor/state is rejected: {error}", throttle_duration_sec=5.0)
+            return
+        if self._stamp < 0 < stamp_ns:  # a newcomer: the samples before this tick went by
+            self._taken = samples_until(stamp_ns, self._p.rate)
+        elif stamp_ns < self._stamp:  # the simulator began again
+            self._emg.reset()
+            self._taken = 0
+            self._ticks.clear()
+        self._stamp = stamp_ns
+        self._ticks.append(stamp_ns)
+        self._answer()
+
+    def _answer(self) -> None:
+        """One reference for each tick whose samples are all here."""
+        while self._ticks and self._peers.complete:
+            needed = samples_until(self._ticks[0], self._p.rate)
+            while self._taken < needed and all(self._channels):
+                self._take()
+            if self._taken < needed:
+                return
+            self._ticks.popleft()
+            self._publish()
+
+    def _check(self) -> None:
+        if not self._peers.complete and not self._peers.missing():
+            self._answer()
+
+    def _status(self) -> tuple[bytes, str, dict[str, object]]:
+        values = {"reference_rad": f"{self._emg.reference:.6g}", "switch_events": self._switches,
+                  "samples": self._taken}
+        if self._lockstep and (missing := self._peers.missing()):
+            return WARN, f"waiting for {', '.join(missing)}", values
+        if self._health.last_input is None:
+            return WARN, "waiting for emg/flexor and emg/extensor", values
+        if self._ticks:
+            return OK, "waiting for EMG samples", values
+        return OK, "running", values
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run_node("hannes_control.emg_reference_node:EmgReferenceNode"))
+
+
+if __name__ == "__main__":
+    main()
