@@ -11,7 +11,14 @@ from hannes_bags.recording import Channel, Recording
 from hannes_description.signals import SIGNALS
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-MOTOR = ("reference_position", "encoder_position", "encoder_velocity", "motor_effort", "motor_current", "motor_voltage")
+MOTOR = (
+    "reference_position",
+    "encoder_position",
+    "encoder_velocity",
+    "motor_effort",
+    "motor_current",
+    "motor_voltage",
+)
 
 
 def canonical(time: np.ndarray) -> np.ndarray:
@@ -29,15 +36,26 @@ def values_of(name: str, n: int, rng: np.random.Generator) -> Any:
     return rng.normal(size=n)
 
 
-def recording(n: int = 400, names: tuple[str, ...] = tuple(SIGNALS), seed: int = 0, start_ns: int = 0) -> Recording:
+def recording(
+    n: int = 400, names: tuple[str, ...] = tuple(SIGNALS), seed: int = 0, start_ns: int = 0
+) -> Recording:
     """Every signal: JointState topics each ms, the others in odd multiples of it with an offset."""
     rng = np.random.default_rng(seed)
     channels = {}
     for k, name in enumerate(names):
         joints = SIGNALS[name].type == cdr.JOINT_STATE
-        time = np.arange(n) * 1e-3 if joints else 1e-4 * k + np.arange(max(1, n // (1 + k % 4))) * 1e-3 * (1 + k % 4)
+        time = (
+            np.arange(n) * 1e-3
+            if joints
+            else 1e-4 * k + np.arange(max(1, n // (1 + k % 4))) * 1e-3 * (1 + k % 4)
+        )
         channels[name] = Channel(canonical(time), values_of(name, len(time), rng), SIGNALS[name].unit, name)
-    metadata = {"condition": "slow", "object": {"shape": "sphere", "size": 0.06}, "closures": [0.0, 4.0], "seed": seed}
+    metadata = {
+        "condition": "slow",
+        "object": {"shape": "sphere", "size": 0.06},
+        "closures": [0.0, 4.0],
+        "seed": seed,
+    }
     return Recording(channels, metadata, "memory", "", start_ns)
 
 
@@ -61,7 +79,10 @@ def foreign_bag(
 
 
 def motor_messages(
-    stamps: np.ndarray, logs: np.ndarray | None = None, joint: tuple[str, ...] = ("motor_pulley",), prefix: str = "/hannes"
+    stamps: np.ndarray,
+    logs: np.ndarray | None = None,
+    joint: tuple[str, ...] = ("motor_pulley",),
+    prefix: str = "/hannes",
 ) -> dict[str, tuple[str, list[tuple[int, bytes]]]]:
     """motor/state stamped `stamps` ns and logged at `logs` ns, motor/current logged just behind it."""
     logs = stamps if logs is None else logs

@@ -39,7 +39,9 @@ def test_arrays_are_read_only_copies() -> None:
 
 def test_require_lists_missing_and_present() -> None:
     short = recording(names=("motor_current", "motor_voltage"))
-    with pytest.raises(HannesError, match=r"lacks grip_force \(topic grip_force\), encoder_position.*It has: motor_current"):
+    with pytest.raises(
+        HannesError, match=r"lacks grip_force \(topic grip_force\), encoder_position.*It has: motor_current"
+    ):
         short.require(("grip_force", "encoder_position", "motor_current"))
     with pytest.raises(HannesError, match="Unknown signal 'force'"):
         short.require(("force",))

@@ -21,7 +21,9 @@ pytestmark = pytest.mark.filterwarnings("ignore::hannes_bags.reading.RecordingWa
 
 @pytest.mark.parametrize("compression", ["none", "zstd"])
 @pytest.mark.parametrize("start_ns", [0, 1_795_254_430_865_171_302])
-def test_values_stamps_and_metadata_come_back_exactly(tmp_path: Path, compression: str, start_ns: int) -> None:
+def test_values_stamps_and_metadata_come_back_exactly(
+    tmp_path: Path, compression: str, start_ns: int
+) -> None:
     made = recording(start_ns=start_ns)
     back = read_bag(write_recording(made, tmp_path / "bag", compression=compression))  # type: ignore[arg-type]
     assert back.differences(made) == []
@@ -99,7 +101,9 @@ def test_metadata_yaml_is_rosbag2_version_9(tmp_path: Path) -> None:
     assert information["version"] == 9 and information["storage_identifier"] == "mcap"
     assert information["custom_data"]["seed"] == "0"
     assert all(isinstance(value, str) for value in information["custom_data"].values())
-    counts = {t["topic_metadata"]["name"]: t["message_count"] for t in information["topics_with_message_count"]}
+    counts = {
+        t["topic_metadata"]["name"]: t["message_count"] for t in information["topics_with_message_count"]
+    }
     assert sum(counts.values()) == information["message_count"] == information["files"][0]["message_count"]
     first = information["topics_with_message_count"][0]["topic_metadata"]
     assert first["offered_qos_profiles"][0]["reliability"] == "reliable"
@@ -119,7 +123,9 @@ def test_a_bag_is_never_overwritten(tmp_path: Path) -> None:
 
 def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
     whole = recording(names=MOTOR)
-    shifted = Channel(whole["encoder_velocity"].time + 1e-3, whole["encoder_velocity"].values, "rad/s", "encoder_velocity")
+    shifted = Channel(
+        whole["encoder_velocity"].time + 1e-3, whole["encoder_velocity"].values, "rad/s", "encoder_velocity"
+    )
     with pytest.raises(HannesError, match="encoder_velocity and encoder_position share"):
         write_recording(Recording({**whole.channels, "encoder_velocity": shifted}), tmp_path / "a")
     with pytest.raises(HannesError, match="without the position"):

@@ -254,12 +254,12 @@ class Limits:
 
     chunk_bytes  the largest chunk that is unpacked
     total_bytes  unpacked bytes in all
-    messages     messages in all
+    messages     records in all, which are nearly all messages
     """
 
     chunk_bytes: int = 256 * 1024 * 1024
     total_bytes: int = 1024 * 1024 * 1024
-    messages: int = 6_000_000
+    messages: int = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -296,6 +296,7 @@ class McapScan:
     salvaged_bytes: int = 0
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     _unpacked: int = 0
+    _records: int = 0
 
     def messages(self) -> Iterator[tuple[int, int, int, memoryview]]:
         """Yield (channel id, log time ns, publish time ns, CDR bytes) in the order of the file."""
@@ -408,8 +409,12 @@ class McapScan:
                     raise McapDamage(f"a message names the unknown channel {channel_id}", origin)
                 self._count(origin)
                 yield channel_id, log_ns, publish_ns, data[begin + _MESSAGE_BODY.size : end]
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._define(opcode, data, begin, end)
+            else:
+                self._count_record(origin)
+                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    self._define(opcode, data, begin, end)
+                elif opcode == 0:
+                    raise McapDamage("a record in a chunk has no kind", origin)
             position = end
 
     def _message(self, begin: int, end: int) -> tuple[int, int, int, memoryview]:
@@ -423,11 +428,16 @@ class McapScan:
 
     def _count(self, origin: int) -> None:
         self.message_count += 1
-        if self.message_count > self.limits.messages:
+        self._count_record(origin)
+
+    def _count_record(self, origin: int) -> None:
+        self._records += 1
+        if self._records > self.limits.messages:
             raise McapDamage(f"there are more than {self.limits.messages} messages", origin)
 
     def _note(self, opcode: int, begin: int, end: int) -> None:
         buffer = self.buffer
+        self._count_record(begin)
         if opcode == Opcode.HEADER:
             self.profile, _ = _string(buffer, begin, end)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -458,7 +468,7 @@ class McapScan:
             known = self.channels.setdefault(identity, channel)
             if known != channel:
                 raise McapDamage(
-                    f"channel {identity} is defined twice, as {known.topic} and as {topic}", begin
+                    f"channel {identity} is defined twice, as {known.topic!r} and as {topic!r}", begin
                 )
 
     def _check_data_crc(self, begin: int, end: int, position: int) -> None:

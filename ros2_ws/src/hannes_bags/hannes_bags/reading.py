@@ -98,7 +98,7 @@ def read_bag(
 
     topics  by signal name (or canonical topic), the topic that carries it where the name says it differently,
             or where two topics might be meant; None leaves the signal out
-    limits  how much is read at most; by default 6 million messages and 1 GiB
+    limits  how much is read at most; by default 5 million messages and 1 GiB
 
     Raises HannesError: unreadable or damaged bag, ambiguous or missing topic, wrong type, undecodable
     message, NaN, stamps that go back.
@@ -327,11 +327,12 @@ class _Reader:
                     samples[signal.name] = (stamps, values[:, 0])
 
     def _drop_repeats(self, names: list[str], samples: dict[str, tuple[IntArray, npt.NDArray[Any]]]) -> None:
-        """Leave out messages that repeat the one before them, stamp and all (lock-step repeats to
-        newcomers)."""
+        """Leave out messages that repeat the one before, stamp and all (lock-step repeats for newcomers)."""
         if not names or len({len(samples[name][0]) for name in names}) != 1:
             return
         times = samples[names[0]][0]
+        if len(times) < 2:
+            return
         repeated = np.concatenate([[False], np.diff(times) == 0])
         for name in names:
             values = samples[name][1]

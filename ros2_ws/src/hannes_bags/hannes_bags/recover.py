@@ -28,7 +28,9 @@ from .storage import (
     MCAP_METADATA,
     METADATA_FILE,
     decode_entries,
+    is_name,
     load_metadata,
+    one_line,
     open_sqlite,
     sqlite_topics,
 )
@@ -89,6 +91,11 @@ class _Salvage:
     metadata: dict[str, Any] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     unread_bytes: int = 0
+
+    def leave_out(self, sentence: str) -> None:
+        """Note once what was left out many times."""
+        if sentence not in self.damage:
+            self.damage.append(sentence)
 
 
 def recover(path: str | Path, out: str | Path) -> Recovery:
@@ -210,12 +217,12 @@ def _messages(files: list[Path], salvage: _Salvage) -> Iterator[tuple[str, int, 
     for file in files:
         read = _mcap_messages if file.suffix == ".mcap" else _sqlite_messages
         for topic, log_ns, data in read(file, salvage):
-            if 0 <= log_ns < 2**63:
+            if not (is_name(topic) and is_name(salvage.definitions[topic].type)):
+                salvage.leave_out(f"{file.name}: messages on a topic without a proper name were left out.")
+            elif 0 <= log_ns < 2**63:
                 yield topic, log_ns, data
             else:
-                salvage.damage.append(
-                    f"{file.name}: a message on {topic} has an impossible time; it was left out."
-                )
+                salvage.leave_out(f"{file.name}: messages on {topic} with impossible times were left out.")
 
 
 def _buffers(file: Path) -> Iterator[memoryview]:
@@ -281,7 +288,7 @@ def _sqlite_messages(file: Path, salvage: _Salvage) -> Iterator[tuple[str, int, 
                     if identity in topics and isinstance(log_ns, int) and isinstance(data, bytes):
                         yield topics[identity], log_ns, data
         except (sqlite3.Error, sqlite3.Warning, OverflowError, UnicodeDecodeError) as error:
-            salvage.damage.append(f"{file.name}: {error}.")
+            salvage.damage.append(f"{file.name}: {one_line(error)}.")
 
 
 def _with_text(connection: sqlite3.Connection, definition: _Definition) -> _Definition:
@@ -308,7 +315,7 @@ def _rows_around_damage(
     query = "SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY rowid"
     rows, error = _rows_until_error(connection, query, ())
     if error is not None:
-        salvage.damage.append(f"{name}: {error}.")
+        salvage.damage.append(f"{name}: {one_line(error)}.")
         reached = rows[-1][0] if rows else -(2**63)
         behind, _ = _rows_until_error(
             connection, query.replace("ORDER", "WHERE rowid > ? ORDER") + " DESC", (reached,)

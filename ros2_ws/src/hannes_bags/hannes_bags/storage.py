@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import mmap
+import re
 import sqlite3
 import stat
 from collections.abc import Collection, Iterator, Mapping
@@ -33,6 +34,7 @@ MCAP_METADATA = "hannes"
 _METADATA_BYTES = 256 * 1024
 _STORAGE = {".mcap": "mcap", ".db3": "sqlite3"}
 _RECOVER = "Run `hannes recover {} NEW_FOLDER` to save what is in it."
+_NAME = re.compile(r"[A-Za-z0-9_/]{1,255}")
 _SQLITE_STEPS_PER_BYTE = 50
 _SQLITE_STEPS_LEAST = 20_000_000
 
@@ -83,6 +85,16 @@ class BagFiles:
 def recover_hint(path: Path) -> str:
     """What to do about a bag that is not whole."""
     return _RECOVER.format(path)
+
+
+def one_line(text: object) -> str:
+    """Words that may hold a bag's bytes, fit for a message: printable, on one line, not long."""
+    return "".join(c if c.isprintable() else "?" for c in str(text))[:200]
+
+
+def is_name(text: str) -> bool:
+    """Whether a text may be the name of a topic or of a message type in ROS 2."""
+    return _NAME.fullmatch(text) is not None
 
 
 def locate(path: str | Path) -> BagFiles:
@@ -196,7 +208,7 @@ def load_metadata(path: Path) -> dict[str, Any]:
         reason = (
             "it is nested too deeply" if isinstance(error, RecursionError) else str(error).replace("\n", " ")
         )
-        raise HannesError(f"{path} is not readable YAML: {reason} {recover_hint(path.parent)}") from None
+        raise HannesError(f"{path} is not readable YAML: {reason}. {recover_hint(path.parent)}") from None
     information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
     if not isinstance(information, dict):
         raise HannesError(f"{path} lacks rosbag2_bagfile_information. {recover_hint(path.parent)}")
@@ -277,6 +289,11 @@ class BagMessages:
         )
 
     def _meet(self, path: Path, topic: str, msgtype: str, encoding: str, type_hash: str, qos: str) -> None:
+        if not (is_name(topic) and is_name(msgtype)):
+            raise HannesError(
+                f"{path} is damaged: it has a topic called {one_line(topic)!r} of type {one_line(msgtype)!r}. "
+                + recover_hint(self.bag.path)
+            )
         known = self.types.setdefault(topic, msgtype)
         if known != msgtype:
             raise HannesError(f"{path}: topic {topic} has messages of two types, {known} and {msgtype}.")
@@ -339,7 +356,7 @@ class BagMessages:
                         raise HannesError(f"{path} holds more than can be read at once: {_say(self.limits)}.")
                     yield topics[identity], log_ns, data
         except (sqlite3.Error, sqlite3.Warning, OverflowError, UnicodeDecodeError) as error:
-            raise HannesError(f"{path} is damaged: {error}. {recover_hint(path)}") from None
+            raise HannesError(f"{path} is damaged: {one_line(error)}. {recover_hint(path)}") from None
 
     def _unpacker(self) -> Any:
         budget = self.limits.total_bytes
