@@ -1,7 +1,7 @@
 """The hand as a MuJoCo model, built from the parameters.
 
-Coordinates (variant transmission="wires"): a slide `motor` [m] is the wire that the pulley has taken up, its armature the
-rotor's inertia / radius^2.  Two carts on guides, c1 (index and middle) and c2 (ring and little), are movable pulleys of
+Coordinates (variant transmission="wires"): a slide `motor` [m] is the wire that the pulley has taken up, its mass the rotor's
+inertia / radius^2.  Two carts on guides, c1 (index and middle) and c2 (ring and little), are movable pulleys of
 the master wire:
 
     master   x_motor - 2 c1 - 2 c2 - w_thumb               <= 0
@@ -46,7 +46,7 @@ PAIRS: tuple[tuple[str, str], tuple[str, str]] = (("index", "middle"), ("ring", 
 # what it connects); it keeps the light carts stable at the default step and leaves stiffness and damping exact.
 WIRE_IMPEDANCE, STOP_IMPEDANCE, CONTACT_IMPEDANCE = 0.9, 0.9, 0.5
 
-FRICTION_SOLREF, FRICTION_SOLIMP = (0.002, 1.0), (0.9999, 0.9999, 0.001, 0.5, 2.0)
+FRICTION_SOLREF, FRICTION_SOLIMP = (0.0005, 1.0), (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Dry friction: the creep speed under a load f is f A (1 - d) / b; the defaults creep by degrees a second."""
 
 GRASP_CENTRE = (0.036, 0.004, 0.088)
@@ -196,8 +196,8 @@ def build_spec(parameters: Parameters, variant: Variant | Mapping[str, Any] | No
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.iterations = 30
-    option.ls_iterations = 20
-    option.tolerance = 1e-10
+    option.ls_iterations = 50
+    option.tolerance = 1e-8
     option.gravity = [v("gravity.palmar"), v("gravity.radial"), v("gravity.distal")]
     disable = mujoco.mjtDisableBit
     # A divergence must show instead of being reset; islands and mid-phase cost more than they save in so small a model.
@@ -330,9 +330,10 @@ def _add_wires(spec: mujoco.MjSpec, palm: Any, parameters: Parameters) -> None:
         return value(parameters, name)
 
     radius = v("pulley.radius")
-    motor = _slide(palm, MOTOR, (0.0, 0.0, 0.0), 1e-6)
+    # The rotor is a mass, not an armature: the compiler leaves the armature out of the constraint weights, and the
+    # motor's dry friction would creep at centimetres a second.
+    motor = _slide(palm, MOTOR, (0.0, 0.0, 0.0), reflected_mass(parameters))
     motor.limited = False
-    motor.armature = reflected_mass(parameters)
     motor.frictionloss = v("friction.coulomb") / radius
     _scalar(motor, "damping", v("friction.viscous") / radius**2)
     for name, side in zip(CARTS, (0.01, -0.01), strict=True):
