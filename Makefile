@@ -4,7 +4,7 @@ VENV ?= $(CURDIR)/.venv
 BIN := $(VENV)/bin
 TESTS ?= tests
 # -n 2: two tests at a time; each test of ROS nodes has a domain id of its own
-PYTEST_FLAGS ?= -n 2
+PYTEST_FLAGS ?= -n 2 --dist loadgroup
 export VENV
 
 .DEFAULT_GOAL := help

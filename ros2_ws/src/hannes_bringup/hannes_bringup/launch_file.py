@@ -22,7 +22,19 @@ from hannes_description.errors import HannesError
 ACTION_KEYS = {
     "arg": ("name", "default", "description", "choice"),
     "let": ("name", "value", "if", "unless"),
-    "node": ("pkg", "exec", "name", "namespace", "param", "remap", "args", "output", "if", "unless"),
+    "node": (
+        "pkg",
+        "exec",
+        "name",
+        "namespace",
+        "param",
+        "remap",
+        "args",
+        "output",
+        "on_exit",
+        "if",
+        "unless",
+    ),
 }
 _SUBSTITUTION = re.compile(r"\$\(([^()]*)\)")
 
@@ -39,12 +51,16 @@ class Argument:
 
 @dataclass(frozen=True)
 class NodeProcess:
-    """A node to start: package, executable, the name to show, and what follows the program on the command line."""
+    """A node to start: package, executable, the name to show, and what follows the program on the command line.
+
+    required  `on_exit: shutdown`: when it ends, all end
+    """
 
     package: str
     executable: str
     name: str
     arguments: tuple[str, ...]
+    required: bool = False
 
 
 @dataclass(frozen=True)
@@ -191,11 +207,25 @@ class _Reader:
                 command += ["--params-file", self._text(item["from"])]
             else:
                 value = item["value"]
-                typed = yaml.safe_load(self._text(value)) if isinstance(value, str) else value
+                typed = self._typed(value) if isinstance(value, str) else value
                 command += ["-p", f"{self._text(item['name'])}:={json.dumps(typed)}"]
         for item in self._items(body, "remap", ("from", "to")):
             command += ["-r", f"{self._text(item['from'])}:={self._text(item['to'])}"]
-        return NodeProcess(package, executable, name, tuple(command))
+        on_exit = body.get("on_exit")
+        if on_exit not in (None, "shutdown"):
+            raise HannesError(f"{self.path.name}: on_exit of {name} is '{on_exit}'; valid is shutdown.")
+        return NodeProcess(package, executable, name, tuple(command), required=on_exit is not None)
+
+    def _typed(self, value: str) -> Any:
+        """A parameter's text as YAML, as launch_ros does: `3` is a number, nothing is the empty text."""
+        text = self._text(value)
+        try:
+            typed = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise HannesError(
+                f"{self.path.name}: the value '{text}' of a parameter is not valid YAML."
+            ) from error
+        return "" if typed is None else typed
 
     def _items(self, body: Mapping[str, Any], key: str, valid: tuple[str, ...]) -> list[dict[str, Any]]:
         items = body.get(key) or []

@@ -47,7 +47,15 @@ def find_command(package: str, executable: str, environment: Mapping[str, str]) 
     for entry in _entry_points(package):
         if entry.name == executable:
             module, _, function = entry.value.partition(":")
-            code = f"import sys; from {module} import {function}; sys.argv[0] = {executable!r}; sys.exit({function}())"
+            # a signal that comes during the imports ends the node as quietly as a later one
+            code = (
+                "import os, signal, sys\n"
+                "for number in (signal.SIGINT, signal.SIGTERM):\n"
+                "    signal.signal(number, lambda *_: os._exit(0))\n"
+                f"sys.argv[0] = {executable!r}\n"
+                f"from {module} import {function}\n"
+                f"sys.exit({function}())"
+            )
             return [sys.executable, "-c", code]
         found.add(entry.name)
     if found:
@@ -82,7 +90,7 @@ def share_folder(package: str, environment: Mapping[str, str]) -> Path:
 
 
 def launch(plan: LaunchPlan, environment: Mapping[str, str]) -> int:
-    """Start the nodes of a plan and wait until all have ended, one has failed, or SIGINT or SIGTERM comes.
+    """Start the nodes of a plan; wait until all or a required one ended, one failed, or SIGINT or SIGTERM comes.
 
     All are stopped then. Returns 0 if every node ended with 0, else 1.
     """
@@ -90,13 +98,14 @@ def launch(plan: LaunchPlan, environment: Mapping[str, str]) -> int:
         (node.name, [*find_command(node.package, node.executable, environment), *node.arguments])
         for node in plan.nodes
     ]
+    required = {node.name for node in plan.nodes if node.required}
     raise_on_signals()
     group = ProcessGroup(lambda text: print(text, file=sys.stderr, flush=True), environment)
     try:
         with group:
             for name, command in commands:
                 group.start(name, command)
-            group.wait(lambda codes: any(codes.values()))
+            group.wait(lambda codes: any(codes.values()) or not required.isdisjoint(codes))
     except Interrupted:
         # the signal may have come while a failure was being cleaned up; it is ignored from now on
         group.stop()

@@ -49,9 +49,10 @@ def graph(
     model: Annotated[
         str, typer.Option(help="Name or path of the model that hand_sim simulates.")
     ] = "nominal",
-    emg: Annotated[
-        str, typer.Option(help="synthetic, or the path of a two-channel EMG recording (.csv).")
-    ] = "synthetic",
+    emg: Annotated[str, typer.Option(help="Two-channel EMG recording (.csv); empty for synthetic EMG.")] = "",
+    duration: Annotated[
+        float, typer.Option(min=0.0, help="End after this simulated time, s; 0 for never.")
+    ] = 0.0,
     record: Annotated[str, typer.Option(help="Folder of a new bag to record into; empty for none.")] = "",
     arguments: Annotated[
         list[str] | None,
@@ -65,7 +66,13 @@ def graph(
     """
     require_ros()
     environment = ros_environment()
-    given = {"clock": clock, "object": object, "model": _absolute(model), "emg": _absolute(emg)}
+    given = {
+        "clock": clock,
+        "object": object,
+        "model": _absolute(model),
+        "emg": _absolute(emg),
+        "duration": str(duration),
+    }
     if record:
         given |= {"record": "true", "bag": os.path.abspath(record)}
     given |= parse_launch_arguments(arguments or [])

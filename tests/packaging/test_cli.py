@@ -1,0 +1,149 @@
+"""The `hannes` command: every subcommand has help, mistakes cost one line and exit code 2, and it starts quickly."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hannes_bringup.cli import COMMANDS, Command, build_app, load
+from hannes_bringup.cli.run import NODES
+from workspace import PACKAGES
+
+
+def hannes(*words: str, **options: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "hannes_bringup.cli", *words], capture_output=True, text=True,
+                          timeout=60, **options)
+
+
+def test_help_lists_every_subcommand_and_imports_none() -> None:
+    code = (
+        "import sys; sys.argv = ['hannes', '--help']\n"
+        "from hannes_bringup.cli import main\n"
+        "try:\n    main()\n"
+        "finally:\n    print('LOADED', *sorted(m for m in sys.modules if '.' not in m), file=sys.stderr)\n"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert answer.returncode == 0, answer.stderr
+    for command in COMMANDS:
+        assert re.search(rf"^\s+{command.name}\s", answer.stdout, re.MULTILINE), command.name
+    loaded = set(answer.stderr.split("LOADED")[1].split())
+    assert not loaded & {"numpy", "rclpy", "mujoco", "numba", "sklearn", "scipy", "matplotlib", "rosbags", "pandas"}
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=[command.name for command in COMMANDS])
+def test_every_subcommand_has_help(command: Command) -> None:
+    from typer.testing import CliRunner
+
+    answer = CliRunner().invoke(build_app(), [command.name, "--help"])
+    assert answer.exit_code == 0, answer.output
+    assert f"hannes {command.name}" in answer.output
+    assert callable(load(command))
+
+
+def test_one_subcommand_for_real() -> None:
+    answer = hannes("model", "show", "--help")
+    assert answer.returncode == 0 and "--json" in answer.stdout
+
+
+def test_version() -> None:
+    from hannes_bringup import __version__
+
+    answer = hannes("--version")
+    assert (answer.returncode, answer.stdout.split()) == (0, ["hannes", __version__])
+
+
+def test_model_show_says_where_every_number_comes_from() -> None:
+    answer = hannes("model", "show", "--json")
+    assert answer.returncode == 0, answer.stderr
+    shown = json.loads(answer.stdout)
+    assert len(shown["sha256"]) == 64
+    for name, parameter in shown["parameters"].items():
+        assert {"value", "unit", "status", "source"} <= set(parameter), name
+    table = hannes("model", "show")
+    assert table.returncode == 0
+    assert all(name in table.stdout for name in shown["parameters"])
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("model", "show", "nope"), "No model 'nope'"),
+        (("model", "show", "/nowhere/model.yaml"), "/nowhere/model.yaml"),
+        (("run", "graph", "--clock", "sundial"), "valid are realtime, lockstep"),
+        (("run", "graph", "--object", "cat"), "valid are none, soft, rigid"),
+        (("run", "graph", "speed:=3"), "no argument 'speed'"),
+        (("run", "graph", "speed"), "name:=value"),
+        (("model", "show", "--nonsense"), "--nonsense"),
+        (("sing",), "sing"),
+    ],
+)
+def test_a_mistake_costs_one_clear_error(words: tuple[str, ...], says: str) -> None:
+    answer = hannes(*words)
+    assert answer.returncode == 2, answer.stdout + answer.stderr
+    assert says in answer.stderr
+    assert "Traceback" not in answer.stderr
+    if not answer.stderr.startswith("Usage"):
+        assert len(answer.stderr.strip().splitlines()) == 1
+
+
+def test_interrupt_is_130() -> None:
+    code = (
+        "import sys, hannes_bringup.cli as cli\n"
+        "def interrupted(): raise KeyboardInterrupt\n"
+        "cli.build_app = lambda: interrupted\n"
+        "sys.exit(cli.main())"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (answer.returncode, answer.stderr) == (130, "")
+
+
+def test_without_ros_the_ros_commands_say_what_to_do() -> None:
+    code = (
+        "import sys, hannes_bringup.environment as e\n"
+        "e.find_spec = lambda name: None\n"
+        "sys.argv = ['hannes', 'nodes']\n"
+        "from hannes_bringup.cli import main; sys.exit(main())"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert answer.returncode == 2 and "make setup" in answer.stderr and "Traceback" not in answer.stderr
+
+
+def test_run_knows_every_executable_of_the_workspace() -> None:
+    declared = {
+        name: package.name for package in PACKAGES.values() for name in package.entry_points
+        if name not in ("hannes", "hannes_ros2")
+    }
+    assert declared == NODES
+
+
+@pytest.mark.ros
+def test_nodes_sees_a_running_node(ros_environment: dict[str, str], tmp_path: Path) -> None:
+    ready = tmp_path / "ready"
+    talker = f"""
+import pathlib, rclpy
+from std_msgs.msg import Float64
+rclpy.init()
+node = rclpy.create_node("talker", namespace="/hannes")
+publisher = node.create_publisher(Float64, "chatter", 10)
+node.create_timer(0.01, lambda: publisher.publish(Float64(data=1.0)))
+pathlib.Path({str(ready)!r}).touch()
+while True:
+    rclpy.spin_once(node, timeout_sec=0.1)
+"""
+    child = subprocess.Popen([sys.executable, "-c", talker], env=ros_environment)
+    try:
+        answer = hannes("nodes", "--json", "--window", "1", env=ros_environment)
+    finally:
+        child.kill()
+        child.wait()
+    assert answer.returncode == 0, answer.stderr
+    seen = json.loads(answer.stdout)
+    assert [node["name"] for node in seen["nodes"]] == ["/hannes/talker"]
+    topic = next(topic for topic in seen["topics"] if topic["name"] == "/hannes/chatter")
+    assert topic["type"] == "std_msgs/msg/Float64"
+    assert (topic["publishers"], topic["subscribers"]) == (1, 0)
+    assert topic["messages"] > 10 and 50 < topic["rate"] < 150 and topic["age"] < 0.5
