@@ -49,7 +49,7 @@ WIRE_IMPEDANCE, STOP_IMPEDANCE, CONTACT_IMPEDANCE = 0.9, 0.9, 0.5
 FRICTION_SOLREF, FRICTION_SOLIMP = (0.0005, 1.0), (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Dry friction: the creep speed under a load f is f A (1 - d) / b; the defaults creep by degrees a second."""
 
-GRASP_CENTRE = (0.036, 0.004, 0.088)
+GRASP_CENTRE = (0.052, 0.0, 0.092)
 """m, palm frame: middle of the space that fingers and thumb close on."""
 
 BAR_HALF_LENGTH = 0.06
