@@ -24,8 +24,7 @@ test: setup ## all tests
 	@$(BIN)/python -m pytest $(PYTEST_FLAGS) $(TESTS)
 
 check: setup ## ruff and mypy
-	@$(BIN)/ruff check .
-	@$(BIN)/mypy --config-file pyproject.toml
+	@status=0; $(BIN)/ruff check . || status=1; $(BIN)/mypy --config-file pyproject.toml || status=1; exit $$status
 
 bench: setup ## speed and identification benchmarks, as ratios in one run
 	@for file in bench/*.py; do echo "== $$file"; $(BIN)/python $$file || exit 1; done
