@@ -1,0 +1,85 @@
+"""What chance reaches: misfit and best gain of data in which nothing is missing, from the repeats themselves.
+
+Wild bootstrap over closures: the deviations of the closures from their mean, with random signs, averaged, are one draw
+of the noise of the mean (Liu 1988, Mammen 1993).  It keeps all correlation along the closure and between signals, and it
+assumes no distribution.  With too few closures to resample, draws come from the estimated covariance instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .fit import Fit
+from .problem import Problem
+
+Array = NDArray[np.float64]
+
+MIN_CLOSURES = 5
+"""Fewer closures cannot be resampled: their signs span too few draws."""
+
+
+@dataclass(frozen=True)
+class Chance:
+    """Quantiles under "nothing is missing".
+
+    misfit      critical value of the fitted cost of a complete model
+    gain        critical value of the best gain of any effect of the catalogue
+    draws       number of draws; resampled: from the closures (True) or from the covariance (False)
+    """
+
+    misfit: float
+    gain: float
+    median: float
+    draws: int
+    resampled: bool
+
+
+def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple[Array, bool]:
+    """Whitened noise of the features (size, draws)."""
+    blocks = problem.features.blocks
+    resampled = all(block.n >= MIN_CLOSURES for block in blocks)
+    if not resampled:
+        return rng.standard_normal((problem.features.size, draws)), False
+    raw = np.empty((problem.features.size, draws))
+    signs: dict[tuple[str, int], Array] = {}
+    for block, rows in zip(blocks, problem.features.slices, strict=True):
+        deviation = block.measured - block.measured.mean(axis=0)
+        n = block.n
+        s = signs.setdefault((block.condition, n), rng.choice([-1.0, 1.0], size=(draws, n)))
+        scale = np.sqrt(n / (n - 1.0))
+        for k in range(draws):
+            raw[rows, k] = block.combine(s[k][:, None] * deviation) * scale
+    return problem.whiten(raw), True
+
+
+def chance(problem: Problem, null: Fit, signatures: Mapping[str, Sequence[Array]], *, draws: int = 400,
+           level: float = 0.98, rows: NDArray[np.bool_] | None = None, seed: int = 0) -> Chance:
+    """Critical values at the given level, in the linear approximation around a fit.
+
+    signatures   per effect, derivatives (size, k) at vanishing strength for each start of its shape parameters
+    """
+    rng = np.random.default_rng(seed)
+    noise, resampled = noise_draws(problem, draws, rng)
+    use = np.ones(problem.features.size, dtype=bool) if rows is None else rows
+    noise = noise[use]
+    prior = np.array([1.0 if c.prior else 1e-6 for c in null.coordinates])
+    jacobian = np.vstack([null.jacobian[use], np.diag(np.sqrt(prior))])
+    basis, _ = np.linalg.qr(jacobian)
+    padded = np.vstack([noise, np.zeros((prior.size, draws))])
+    left = padded - basis @ (basis.T @ padded)
+    misfit = (left**2).sum(axis=0)
+    gains = np.zeros(draws)
+    for shapes in signatures.values():
+        for signature in shapes:
+            d = np.vstack([signature[use], np.zeros((prior.size, signature.shape[1]))])
+            d = d - basis @ (basis.T @ d)
+            keep = np.linalg.norm(d, axis=0) > 1e-9
+            if keep.any():
+                q, _ = np.linalg.qr(d[:, keep])
+                gains = np.maximum(gains, ((q.T @ left) ** 2).sum(axis=0))
+    return Chance(float(np.quantile(misfit, level)), float(np.quantile(gains, level)), float(np.median(misfit)), draws,
+                  resampled)

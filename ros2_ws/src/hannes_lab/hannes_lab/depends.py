@@ -1,0 +1,82 @@
+"""What the residual depends on: position, velocity, direction, load or time, and how much of it each explains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .features import Features
+
+Array = NDArray[np.float64]
+
+VARIABLES = ("position", "velocity", "direction", "load", "time")
+BINS = 10
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """Residual of one signal against one variable.
+
+    share    part of the variance of the closures' mean residual that the curve explains (adjusted R2), 0..1
+    centres  (b,) of the variable; curve (b,) mean residual, in the signal's unit
+    """
+
+    variable: str
+    signal: str
+    share: float
+    centres: tuple[float, ...]
+    curve: tuple[float, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"variable": self.variable, "signal": self.signal, "share": self.share, "centres": list(self.centres),
+                "curve": list(self.curve)}
+
+
+def dependences(features: Features, residuals: Mapping[str, list[Array]], states: Mapping[str, list[Array]],
+                signal: str) -> tuple[Dependence, ...]:
+    """Shares of one signal's residual, largest first.
+
+    residuals  signal -> per condition block (n, p) measured - model
+    states     variable -> per condition block (n, p)
+    """
+    r = np.concatenate([a.mean(axis=0) for a in residuals[signal]])
+    out = []
+    for variable in VARIABLES:
+        if variable == "time":
+            values = np.concatenate([np.repeat(np.linspace(0.0, 1.0, a.shape[0]), a.shape[1])
+                                     for a in residuals[signal]])
+            target = np.concatenate([(a - 0.0).ravel() for a in residuals[signal]])
+        else:
+            values = np.concatenate([a.mean(axis=0) for a in states[variable]])
+            target = r
+        out.append(_dependence(variable, signal, values, target))
+    return tuple(sorted(out, key=lambda d: -d.share))
+
+
+def _dependence(variable: str, signal: str, x: Array, y: Array) -> Dependence:
+    if variable == "direction":
+        labels = np.sign(x) * (np.abs(x) > 1e-3)
+        groups = np.unique(labels)
+        index = np.searchsorted(groups, labels)
+    else:
+        edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, BINS + 1)))
+        if edges.size < 3:
+            return Dependence(variable, signal, 0.0, (), ())
+        index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, edges.size - 2)
+        groups = np.arange(edges.size - 1)
+    centres, curve, inside = [], [], 0.0
+    for k in range(groups.size):
+        own = index == k
+        if not own.any():
+            continue
+        centres.append(float(x[own].mean()))
+        curve.append(float(y[own].mean()))
+        inside += float(((y[own] - y[own].mean()) ** 2).sum())
+    total = float((y**2).sum())
+    k, n = len(centres), y.size
+    share = 1.0 - (inside / max(n - k, 1)) / (total / n) if total > 0.0 else 0.0
+    return Dependence(variable, signal, float(np.clip(share, 0.0, 1.0)), tuple(centres), tuple(curve))

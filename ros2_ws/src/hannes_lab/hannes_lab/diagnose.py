@@ -1,0 +1,373 @@
+"""Which physical effect does the model lack?  Nothing, named effects, or something unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from hannes_description.model import EffectEntry, Model
+from hannes_sim.effect import catalogue, effect_source, load_effect
+from numpy.typing import NDArray
+
+from .chance import Chance, chance
+from .depends import Dependence, dependences
+from .errors import (
+    SignalError,
+    held_out_closures,
+    held_out_conditions,
+    overall,
+    signal_errors,
+)
+from .experiments import Experiment, separating_experiments
+from .features import Features
+from .fit import Fit
+from .prepare import Prepared
+from .problem import Problem, build_problem
+from .search import Candidate, Progress, Search, silent
+
+Array = NDArray[np.float64]
+
+ADEQUATE = 1.25
+"""A set of effects is adequate if its cost is at most this multiple of what chance reaches: room for the linear
+approximation behind the critical value."""
+
+WORTHWHILE = 0.05
+"""A further effect must remove at least this part of the cost, and of the error on held-out conditions."""
+
+MAX_EFFECTS = 3
+
+WIDE = (6, 4)
+"""How many of the best singles and pairs are extended by every further effect."""
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """Value and 95 % interval; identified is False where the value lies on its bound or the interval spans the range."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    identified: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        return self.__dict__.copy()
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """An effect of the verdict, with its parameters."""
+
+    name: str
+    title: str
+    source: str | None
+    parameters: Mapping[str, ParameterEstimate]
+    why: str
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"name": self.name, "title": self.title, "source": self.source, "why": self.why,
+                "parameters": {n: p.to_dict() for n, p in self.parameters.items()}}
+
+
+@dataclass(frozen=True)
+class Fall:
+    """One step of the error's fall, in multiples of the repeatability: fitted on every second closure, judged on the
+    others; by_condition: error on each condition when it took no part in the fit."""
+
+    added: str
+    train: float
+    held_out: float
+    by_condition: Mapping[str, float]
+    signals: tuple[SignalError, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"added": self.added, "train": self.train, "held_out": self.held_out,
+                "by_condition": dict(self.by_condition), "signals": [s.to_dict() for s in self.signals]}
+
+
+@dataclass(frozen=True)
+class Rank:
+    """One row of the ranking: the cost of the model with this effect (set) added, after a full refit."""
+
+    names: tuple[str, ...]
+    cost: float
+    explained: float
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"names": list(self.names), "cost": self.cost, "explained": self.explained}
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The answer; `to_dict` is what --json, the report and the page show."""
+
+    verdict: str
+    summary: str
+    effects: tuple[FoundEffect, ...]
+    tied: tuple[tuple[str, ...], ...]
+    experiments: tuple[Experiment, ...]
+    falls: tuple[Fall, ...]
+    ranking: tuple[Rank, ...]
+    depends_on: tuple[Dependence, ...]
+    chance: Chance
+    costs: Mapping[str, float]
+    nuisances: Mapping[str, Mapping[str, float]]
+    notes: tuple[str, ...]
+    simulations: int
+    data: tuple[Mapping[str, Any], ...]
+    model: Model
+
+    def to_dict(self) -> dict[str, Any]:
+        falls = self.falls
+        return {
+            "verdict": self.verdict, "summary": self.summary, "effects": [e.to_dict() for e in self.effects],
+            "tied": [list(names) for names in self.tied], "experiments": [e.to_dict() for e in self.experiments],
+            "error": {"nominal": falls[0].held_out, "final": falls[-1].held_out, "repeatability": 1.0,
+                      "held_out": True, "unit": "multiples of the repeatability between closures"},
+            "falls": [f.to_dict() for f in falls], "ranking": [r.to_dict() for r in self.ranking],
+            "depends_on": {d.variable: d.to_dict() for d in self.depends_on},
+            "chance": self.chance.__dict__.copy(), "costs": dict(self.costs),
+            "nuisances": {n: dict(v) for n, v in self.nuisances.items()}, "notes": list(self.notes),
+            "simulations": self.simulations, "data": [dict(d) for d in self.data],
+            "model": {"name": self.model.name, "sha256": self.model.sha256},
+        }
+
+
+def effect_sources(extra: Sequence[str] = (), *, only: Sequence[str] | None = None, model: Model | None = None
+                   ) -> dict[str, str]:
+    """Effects to consider by name: the catalogue (or `only`) and the user's own, without those the model has."""
+    names = list(only) if only is not None else list(catalogue())
+    out = {load_effect(given).name: given for given in (*names, *extra)}
+    have = {effect.name for effect in model.effects} if model is not None else set()
+    return {name: given for name, given in out.items() if name not in have}
+
+
+def diagnose(prepared: Prepared, sources: Mapping[str, str], *, jobs: int = 1, progress: Progress = silent,
+             max_effects: int = MAX_EFFECTS) -> Diagnosis:
+    """Search the catalogue; see the module docstrings of search, chance and problem for the method."""
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, sources, jobs=jobs, progress=progress)
+    null = search.null()
+    limits = chance(prepared.problem, null.fit, search.signatures(null))
+    best, ranking, adequate = _choose(search, null, limits, max_effects)
+    nothing = not best.names and adequate
+    verdict = "nothing" if nothing else "effects" if adequate else "unknown"
+    tied = _ties(search, best, limits) if verdict == "effects" else ()
+    model = fitted_model(prepared.model, search, best) if best.names else prepared.model
+    falls = error_falls(prepared, search, best, progress)
+    effects = tuple(_found(search, best, name, limits, falls) for name in best.names)
+    experiments = (separating_experiments(prepared, search, [search.found[tuple(sorted(n))] for n in tied])
+                   if len(tied) > 1 else ())
+    return Diagnosis(
+        verdict=verdict, summary=_summary(verdict, effects, tied, falls, limits, best), effects=effects, tied=tied,
+        experiments=experiments, falls=falls, ranking=ranking, depends_on=_depends(prepared, best), chance=limits,
+        costs={"nominal_fitted": null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
+        nuisances=_nuisance_table(best.fit), notes=(*prepared.notes, *_identifiability_notes(best)),
+        simulations=prepared.problem.simulations, data=data_used(prepared.features), model=model)
+
+
+def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int
+            ) -> tuple[Candidate, tuple[Rank, ...], bool]:
+    """Smallest adequate set, the ranking of the first round, and whether it is adequate.
+
+    Sets of one, two and three effects in turn; each round extends the best of the round before by every effect, so that
+    two effects of which neither is best alone are found too.
+    """
+    best, front = null, [null]
+    ranking: tuple[Rank, ...] = ()
+    texts = ("one effect", "two effects", "three effects")
+    for size in range(1, max_effects + 1):
+        adequate = best.fit.cost <= limits.misfit
+        if adequate and size > 1:
+            break
+        round_ = search.extend(front, list(search.sources), texts[size - 1])
+        if not round_:
+            break
+        if size == 1:
+            ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in round_)
+        gain = best.penalised - round_[0].penalised
+        needed = limits.gain if adequate else max(limits.gain, WORTHWHILE * best.fit.cost)
+        if gain < needed:
+            break
+        best = round_[0]
+        front = round_[:WIDE[min(size - 1, len(WIDE) - 1)]]
+    return best, ranking, best.fit.cost <= ADEQUATE * limits.misfit
+
+
+def _share(null: Candidate, candidate: Candidate, limits: Chance) -> float:
+    """Part of the excess misfit that the candidate removes, 0..1."""
+    excess = null.fit.cost - limits.median
+    return float(np.clip((null.fit.cost - candidate.fit.cost) / excess, 0.0, 1.0)) if excess > 0 else 0.0
+
+
+def _ties(search: Search, best: Candidate, limits: Chance) -> tuple[tuple[str, ...], ...]:
+    """Sets of the same size that fit as well as the best within what chance can gain; the best comes first."""
+    close = [c for c in search.found.values()
+             if len(c.names) == len(best.names) and c.penalised <= best.penalised + max(limits.gain, 10.0)]
+    return tuple(c.names for c in sorted(close, key=lambda c: c.penalised))
+
+
+def fitted_model(model: Model, search: Search, best: Candidate) -> Model:
+    """The model with fitted nuisance parameters and effects, as it goes into a file."""
+    values = best.fit.values
+    known = {n: v for n, v in values.items() if "@" not in n and n in model.parameters}
+    out = model.with_values(known, status="identified", source="fitted by hannes together with the effects")
+    intervals = intervals_of(best.fit, 1.0)
+    for name in best.names:
+        out = out.with_effect(_entry(search, name, values, intervals))
+    return replace(out, plant=model.plant)
+
+
+def _entry(search: Search, name: str, values: Mapping[str, float], intervals: Mapping[str, tuple[float, float]]
+           ) -> EffectEntry:
+    kind = search.effect(name)
+    own = {p.name: values[f"{name}.{p.name}"] for p in kind.parameters}
+    spans = {p.name: intervals[f"{name}.{p.name}"] for p in kind.parameters}
+    return kind.entry(own, source=effect_source(kind, search.sources[name]), status="identified",
+                      where="fitted by hannes; bounds are the 95 % interval", intervals=spans)
+
+
+def intervals_of(found: Fit, inflate: float) -> dict[str, tuple[float, float]]:
+    """95 % intervals by name, from the curvature of the cost, inside the parameter's bounds."""
+    sd = np.sqrt(np.maximum(np.diag(found.covariance(inflate)), 0.0))
+    out = {}
+    for c, z, s in zip(found.coordinates, found.z, sd, strict=True):
+        ends = sorted((c.value(float(z - 1.96 * s)), c.value(float(z + 1.96 * s))))
+        out[c.name] = (ends[0], ends[1])
+    return out
+
+
+def _found(search: Search, best: Candidate, name: str, limits: Chance, falls: Sequence[Fall]) -> FoundEffect:
+    kind = search.effect(name)
+    inflate = max(1.0, best.fit.cost / limits.median)
+    intervals = intervals_of(best.fit, inflate)
+    parameters = {}
+    for p in kind.parameters:
+        value = best.fit.values[f"{name}.{p.name}"]
+        low, high = intervals[f"{name}.{p.name}"]
+        span = p.upper - p.lower
+        on_bound = min(value - p.lower, p.upper - value) < 1e-6 * span and p.vanishing != value
+        parameters[p.name] = ParameterEstimate(value, low, high, p.unit, not on_bound and high - low < 0.8 * span)
+    step = next((k for k, f in enumerate(falls) if f.added == name), len(falls) - 1)
+    before = {(s.condition, s.signal): s for s in falls[step - 1].signals}
+    drops = sorted(falls[step].signals, key=lambda s: s.ratio - before[(s.condition, s.signal)].ratio)
+    s = drops[0]
+    b = before[(s.condition, s.signal)]
+    why = (f"Without it the model misses {s.signal} in '{s.condition}' by {b.rmse:.3g} {s.unit} ({b.ratio:.1f} times the "
+           f"repeatability), with it by {s.rmse:.3g} {s.unit} ({s.ratio:.2f} times). What it looks like: "
+           f"{kind.looks_like}.")
+    return FoundEffect(name, kind.title, effect_source(kind, search.sources[name]), parameters, why)
+
+
+def problem_builder(prepared: Prepared, values: Mapping[str, float]) -> Any:
+    """A function from Features to a Problem with noise estimated on those features."""
+    def build(features: Features) -> Problem:
+        return build_problem(prepared.rig, features, prepared.model, prepared.nuisances,
+                             {n.name: values.get(n.name, n.mean) for n in prepared.nuisances})
+    return build
+
+
+def error_falls(prepared: Prepared, search: Search, best: Candidate, progress: Progress) -> tuple[Fall, ...]:
+    """Nominal as given, nominal fitted, then the effects one after another in the order that helps most."""
+    problem, features = prepared.problem, prepared.features
+    build = problem_builder(prepared, best.fit.values)
+    nominal = signal_errors(features, features.closures(prepared.rig, prepared.model, {}))
+    falls = [Fall("nominal, as given", overall(nominal), overall(nominal),
+                  {c: overall([e for e in nominal if e.condition == c]) for c in features.conditions}, nominal)]
+    steps: list[tuple[str, Candidate]] = [("nominal, fitted", search.null())]
+    chain: tuple[str, ...] = ()
+    left = list(best.names)
+    while left:
+        options = [search.found.get(tuple(sorted((*chain, name)))) or search.add(search.found[tuple(sorted(chain))], name)
+                   for name in left]
+        pick = min(range(len(left)), key=lambda k: options[k].penalised) if len(left) > 1 else 0
+        chain = (*chain, left[pick])
+        steps.append((left.pop(pick), options[pick]))
+    for k, (label, candidate) in enumerate(steps):
+        progress(k, len(steps), f"held-out error: {label}")
+        f = candidate.fit
+        train, test = held_out_closures(build, features, f.model, f.coordinates, f.z)
+        by_condition = held_out_conditions(problem, f.model, f.coordinates, f.z)
+        errors = signal_errors(features, features.closures(prepared.rig, f.model, f.values))
+        falls.append(Fall(label, train, test, by_condition, errors))
+    return tuple(falls)
+
+
+def _depends(prepared: Prepared, best: Candidate) -> tuple[Dependence, ...]:
+    features = prepared.features
+    predicted = features.closures(prepared.rig, best.fit.model, best.fit.values)
+    residuals: dict[str, list[Array]] = {}
+    states: dict[str, list[Array]] = {"position": [], "velocity": [], "direction": [], "load": []}
+    for block, closures in zip(features.blocks, predicted, strict=True):
+        residuals.setdefault(block.signal, []).append(block.measured - closures)
+    signals = list(residuals)
+    signal = next((s for s in ("motor_current", "motor_effort") if s in signals), signals[0])
+    by = {(b.condition, b.signal): (b, c) for b, c in zip(features.blocks, predicted, strict=True)}
+    for condition in [b.condition for b in features.blocks if b.signal == signal]:
+        target, load = by[(condition, signal)]
+        place = by.get((condition, "encoder_position"))
+        n = target.n
+        if place is not None:
+            block, closures = place
+            position = np.interp(target.phase, block.phase, closures.mean(axis=0))
+        else:
+            position = load.mean(axis=0)
+        velocity = np.gradient(position, target.phase)
+        states["position"].append(np.tile(position, (n, 1)))
+        states["velocity"].append(np.tile(velocity, (n, 1)))
+        states["direction"].append(np.tile(velocity, (n, 1)))
+        states["load"].append(load)
+    return dependences(features, residuals, states, signal)
+
+
+def _nuisance_table(found: Fit) -> dict[str, dict[str, float]]:
+    intervals = intervals_of(found, 1.0)
+    return {c.name: {"value": c.value(float(z)), "nominal": c.value(0.0), "prior_sds": float(z),
+                     "low": intervals[c.name][0], "high": intervals[c.name][1]}
+            for c, z in zip(found.coordinates, found.z, strict=True) if c.prior}
+
+
+def _identifiability_notes(best: Candidate) -> list[str]:
+    """What this data cannot tell: pairs of effect and nuisance parameters that move the data alike."""
+    cov = best.fit.covariance()
+    sd = np.sqrt(np.maximum(np.diag(cov), 1e-30))
+    correlation = cov / np.outer(sd, sd)
+    notes = []
+    for i, a in enumerate(best.fit.coordinates):
+        for j in range(i):
+            b = best.fit.coordinates[j]
+            if not (a.prior and b.prior) and abs(correlation[i, j]) > 0.97:
+                notes.append(f"{a.name} and {b.name} cannot be told apart well with these data "
+                             f"(correlation {correlation[i, j]:+.3f})")
+    far = [c.name for c, z in zip(best.fit.coordinates, best.fit.z, strict=True) if c.prior and abs(z) > 4.0]
+    if far:
+        notes.append(f"{', '.join(far)} had to move by more than four standard deviations of what is usual: is the "
+                     "nominal model that of this hand?")
+    return notes
+
+
+def _summary(verdict: str, effects: Sequence[FoundEffect], tied: Sequence[Sequence[str]], falls: Sequence[Fall],
+             limits: Chance, best: Candidate) -> str:
+    fall = (f"The error on held-out closures falls from {falls[1].held_out:.2f} (nominal, fitted) to "
+            f"{falls[-1].held_out:.2f} times the repeatability.")
+    if verdict == "nothing":
+        return (f"Nothing is missing: with its own parameters fitted, the model's misfit {best.fit.cost:.0f} is below what "
+                f"chance reaches ({limits.misfit:.0f}), and no effect of the catalogue gains more than chance would. "
+                f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability.")
+    names = " and ".join(e.title for e in effects)
+    if verdict == "effects":
+        tie = ""
+        if len(tied) > 1:
+            others = "; ".join(" + ".join(names_) for names_ in tied[1:])
+            tie = f" With these data it ties with: {others}."
+        return f"Missing: {names}. {fall}{tie}"
+    part = f" The catalogue comes nearest with {names}, which is not enough." if names else ""
+    return (f"Something is missing that is not in the catalogue: the best model's misfit {best.fit.cost:.0f} stays above "
+            f"what chance reaches ({limits.misfit:.0f}).{part} {fall}")
+
+
+def data_used(features: Features) -> tuple[dict[str, Any], ...]:
+    """What data took part: bag, hash, conditions, closures, signals."""
+    return tuple({"name": t.name, "source": t.source, "sha256": t.sha256, "conditions": list(t.conditions),
+                  "closures": len(t.closures), "signals": sorted(t.signals)} for t in features.trials)

@@ -1,0 +1,139 @@
+"""Errors between model and measurement in units that people know: SI, and multiples of the repeatability."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from hannes_description.model import Model
+from numpy.typing import NDArray
+
+from .features import Block, Features
+from .fit import fit
+from .problem import Coordinate, Problem
+from .rig import Rig
+
+Array = NDArray[np.float64]
+
+UNITS = {"encoder_position": "rad", "motor_current": "A", "motor_voltage": "V", "grip_force": "N",
+         "motor_effort": "N.m"}
+
+
+@dataclass(frozen=True)
+class SignalError:
+    """Error of one signal in one condition.
+
+    rmse           root mean square of measured - model over closures and phases, in unit
+    repeatability  root mean square of the closures around their own mean (n - 1 in the denominator), in unit
+    ratio          rmse / repeatability: 1 is as good as the machine repeats itself
+    """
+
+    condition: str
+    signal: str
+    unit: str
+    rmse: float
+    repeatability: float
+    ratio: float
+
+    def to_dict(self) -> dict[str, Any]:
+        return self.__dict__.copy()
+
+
+def repeatability(block: Block) -> float:
+    """Root mean square scatter of the closures of a block, in its unit; NaN for a single closure."""
+    if block.n < 2:
+        return float("nan")
+    e = block.measured - block.measured.mean(axis=0)
+    return float(np.sqrt((e**2).sum(axis=0).mean() / (block.n - 1)))
+
+
+def signal_errors(features: Features, closures: Sequence[Array], floor: Sequence[float] | None = None
+                  ) -> tuple[SignalError, ...]:
+    """Errors of predicted closures, one per block; `floor` replaces the repeatability (held-out parts are too small)."""
+    out = []
+    for k, (block, predicted) in enumerate(zip(features.blocks, closures, strict=True)):
+        rmse = float(np.sqrt(((block.measured - predicted) ** 2).mean()))
+        repeat = repeatability(block) if floor is None else floor[k]
+        out.append(SignalError(block.condition, block.signal, UNITS.get(block.signal, ""), rmse, repeat,
+                               rmse / repeat if repeat > 0 else float("nan")))
+    return tuple(out)
+
+
+def overall(errors: Sequence[SignalError]) -> float:
+    """One number: root mean square of the ratios over all signals and conditions; NaN ratios are left out."""
+    ratios = np.array([e.ratio for e in errors if np.isfinite(e.ratio)])
+    return float(np.sqrt((ratios**2).mean())) if ratios.size else float("nan")
+
+
+def split_closures(features: Features) -> tuple[Features, Features]:
+    """Training and held-out closures: every second closure of each block is held out."""
+    def part(first: int) -> Features:
+        blocks = []
+        for block in features.blocks:
+            pick = slice(first, None, 2) if block.n > 1 else slice(None)
+
+            def cut(index: tuple[Any, ...] | None, chosen: slice = pick) -> Any:
+                return None if index is None else tuple(a[chosen] for a in index)
+
+            blocks.append(replace(block, measured=block.measured[pick], full=cut(block.full),
+                                  compact=cut(block.compact)))
+        return replace(features, blocks=tuple(blocks), slices=())
+
+    return part(0), part(1)
+
+
+def closures_at(rig: Rig, features: Features, model: Model, values: Mapping[str, float]) -> list[Array]:
+    return features.closures(rig, model, values)
+
+
+def held_out_closures(problem_of: Any, features: Features, model: Model, coordinates: Sequence[Coordinate], start: Array
+                      ) -> tuple[float, float]:
+    """(training, held-out) overall error after a refit on the training closures only.
+
+    problem_of   builds a Problem from Features (noise and scatter are estimated on the training closures alone)
+    """
+    train, test = split_closures(features)
+    problem: Problem = problem_of(train)
+    found = fit(problem, model, coordinates, start, evaluations=6)
+    floor = [repeatability(block) for block in features.blocks]
+    inside = signal_errors(train, train.closures(problem.rig, model, found.values), floor)
+    outside = signal_errors(test, test.closures(problem.rig, model, found.values), floor)
+    return overall(inside), overall(outside)
+
+
+def held_out_conditions(problem: Problem, model: Model, coordinates: Sequence[Coordinate], start: Array
+                        ) -> dict[str, float]:
+    """Overall error on each condition when it took no part in the fit.
+
+    Parameters of the held-out recording alone (its object, its encoder zero: `name@condition`) cannot be known from the
+    others; they are then fitted on the held-out condition with everything else kept.
+    """
+    features = problem.features
+    out: dict[str, float] = {}
+    if len(features.conditions) < 2:
+        return out
+    for condition in features.conditions:
+        rows = features.rows(condition)
+        found = fit(problem, model, coordinates, start, rows=~rows, evaluations=6)
+        trial = features.trials[next(b.trial for b in features.blocks if b.condition == condition)].name
+        own = [c for c in coordinates if c.name.endswith(f"@{trial}")]
+        values = found.values
+        if own:
+            local = _Fixed(problem, {n: v for n, v in values.items() if n not in {c.name for c in own}})
+            values = {**values, **fit(local, model, own, {}, rows=rows, evaluations=6).values}
+        errors = signal_errors(features, features.closures(problem.rig, model, values))
+        out[condition] = overall([e for e in errors if e.condition == condition])
+    return out
+
+
+class _Fixed(Problem):
+    """A problem in which some parameters are held."""
+
+    def __init__(self, problem: Problem, held: Mapping[str, float]) -> None:
+        super().__init__(problem.rig, problem.features, problem.whitener)
+        self._held = dict(held)
+
+    def residual(self, model: Model, values: Mapping[str, float]) -> Array:
+        return super().residual(model, {**self._held, **values})

@@ -1,0 +1,122 @@
+"""From bags to a problem that can be searched: outliers out, noise estimated, nominal fitted."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from hannes_bags.reading import read_bag
+from hannes_description.errors import HannesError
+from hannes_description.model import Model
+
+from .features import Features, build_features
+from .fit import fit
+from .hand import HandRig
+from .problem import Problem, build_problem, nuisance_coordinate
+from .rig import Nuisance, Rig
+from .trials import SIGNALS, Trial, make_trial, unique_names
+
+OUTLIER = 6.0
+"""A closure whose distance from the median closure exceeds this multiple of the median distance is left out."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A data set, ready: the rig, the statistical problem and the nuisance parameters of a model."""
+
+    rig: Rig
+    model: Model
+    features: Features
+    problem: Problem
+    nuisances: tuple[Nuisance, ...]
+    notes: tuple[str, ...]
+
+
+def find_bags(paths: Sequence[str | Path]) -> list[Path]:
+    """Bags below the given paths: a bag (folder with metadata.yaml, .mcap, .db3) or a folder of bags."""
+    out: list[Path] = []
+    for given in paths:
+        path = Path(given)
+        if not path.exists():
+            raise HannesError(f"No bag '{given}': the path does not exist.")
+        if path.is_dir() and not (path / "metadata.yaml").exists() and not _storage(path):
+            below = sorted(p for p in path.iterdir() if p.is_dir() and ((p / "metadata.yaml").exists() or _storage(p)))
+            if not below:
+                raise HannesError(f"'{given}' holds no bag: a bag is a folder with metadata.yaml and .mcap or .db3 files.")
+            out += below
+        else:
+            out.append(path)
+    return out
+
+
+def _storage(path: Path) -> list[Path]:
+    return [p for p in path.iterdir() if p.suffix in (".mcap", ".db3")]
+
+
+def load_trials(paths: Sequence[str | Path], signals: Sequence[str] = SIGNALS) -> list[Trial]:
+    """Trials of all bags below the paths; names are made unique."""
+    trials = []
+    for bag in find_bags(paths):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the reader's warnings are kept in the trial's notes
+            trials.append(make_trial(read_bag(bag), signals=signals))
+    return unique_names(trials)
+
+
+def without_outliers(trial: Trial) -> Trial:
+    """Leave out closures that are far from the others of their condition (at least five closures needed)."""
+    kept, dropped = [], []
+    for condition in trial.conditions:
+        closures = trial.of(condition)
+        if len(closures) < 5:
+            kept += list(closures)
+            continue
+        distance = np.zeros(len(closures))
+        for time, values in trial.signals.values():
+            length = min(c.stop - c.start for c in closures)
+            grid = np.linspace(0.02 * length, 0.95 * length, 60)
+            curves = np.array([np.interp(c.start + grid, time, values) for c in closures])
+            away = np.sqrt(((curves - np.median(curves, axis=0)) ** 2).mean(axis=1))
+            distance = np.maximum(distance, away / max(float(np.median(away)), 1e-3 * float(np.ptp(curves)), 1e-12))
+        for closure, far in zip(closures, distance, strict=True):
+            (dropped if far > OUTLIER else kept).append(closure)
+    if not dropped:
+        return trial
+    note = (f"{len(dropped)} closure(s) far from the others are left out, starting at "
+            + ", ".join(f"{c.start:.1f} s" for c in dropped))
+    return replace(trial, closures=tuple(sorted(kept, key=lambda c: c.start)), notes=(*trial.notes, note))
+
+
+def prepare(trials: Sequence[Trial], model: Model, *, rig: Rig | None = None, signals: Sequence[str] | None = None
+            ) -> Prepared:
+    """Estimate noise and scatter at the fitted nominal model.
+
+    rig      another machine's rig; the hand's if None
+    signals  which signals take part; all that are there if None
+    """
+    trials = [without_outliers(trial) for trial in trials]
+    rig = rig or HandRig(trials)
+    present = [s for s in (signals or (*SIGNALS, "motor_effort")) if any(s in t.signals for t in trials)]
+    features = build_features(trials, present)
+    nuisances = tuple(rig.nuisances(model))
+    problem = build_problem(rig, features, model, nuisances, {})
+    coordinates = [nuisance_coordinate(n) for n in nuisances]
+    found = fit(problem, model, coordinates, {}, evaluations=15)
+    sims = problem.simulations
+    problem = build_problem(rig, features, model, nuisances, found.values)
+    problem.simulations = sims
+    notes = [f"{trial.name}: {note}" for trial in trials for note in trial.notes]
+    if len(features.conditions) < 2:
+        notes.append("there is one condition only: what fits it may fail elsewhere; record another speed and a grasp")
+    if "motor_current" not in present and "motor_effort" not in present:
+        notes.append("no current is recorded: friction, torque constant and inertia are hard to tell apart")
+    if "encoder_position" not in present:
+        notes.append("no encoder position is recorded: sensor offsets, slack and backlash cannot be told apart")
+    few = [c for c in features.conditions
+           if all(b.n < 5 for b in features.blocks if b.condition == c)]
+    if few:
+        notes.append(f"fewer than five closures of {', '.join(few)}: the repeatability is a guess from the priors")
+    return Prepared(rig, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))
