@@ -49,10 +49,10 @@ WIRE_IMPEDANCE, STOP_IMPEDANCE, CONTACT_IMPEDANCE = 0.9, 0.9, 0.5
 FRICTION_SOLREF, FRICTION_SOLIMP = (0.0005, 1.0), (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Dry friction: the creep speed under a load f is f A (1 - d) / b; the defaults creep by degrees a second."""
 
-GRASP_CENTRE = (0.052, 0.0, 0.092)
+GRASP_CENTRE = (0.062, 0.0, 0.097)
 """m, palm frame: middle of the space that fingers and thumb close on."""
 
-BAR_HALF_LENGTH = 0.06
+BAR_HALF_LENGTH = 0.045
 """m; half the length of a capsule or box across the fingers."""
 
 

@@ -19,14 +19,14 @@ class GraspObject:
 
     shape      capsule (a bar across the fingers), sphere or box
     size       m, what lies between fingertips and thumb when they touch it (diameter, thickness)
-    stiffness  N/m of the contact between one fingertip and the object, object and fingertip pad together
+    stiffness  N/m of the whole grasp, object and fingertip pads together; each of the five digits' contacts has a fifth
     damping    N.s/m
     friction   Coulomb coefficient
     place      m, offset of its centre in the palm frame from the middle of the grasp
     """
 
     shape: str = "capsule"
-    size: float = 0.045
+    size: float = 0.065
     stiffness: float = 400.0
     damping: float = 2.0
     friction: float = 0.8
@@ -57,10 +57,10 @@ class GraspObject:
         return cls(**values)
 
 
-SOFT_BALL = GraspObject(shape="sphere", size=0.045, stiffness=400.0, damping=2.0)
-"""A ball that deforms visibly (thesis P18): about 0.4 kN/m in all."""
+SOFT_BALL = GraspObject(shape="sphere", size=0.080, stiffness=400.0, damping=2.0, place=(-0.012, -0.002, 0.004))
+"""A ball that deforms visibly (thesis P18): about 0.4 kN/m in all; so large that all fingers but the little reach it."""
 
-RIGID_DYNAMOMETER = GraspObject(shape="capsule", size=0.045, stiffness=40000.0, damping=20.0)
+RIGID_DYNAMOMETER = GraspObject(shape="capsule", size=0.065, stiffness=40000.0, damping=20.0)
 """A hand dynamometer (thesis P17): at least 40 kN/m."""
 
 OBJECTS: Mapping[str, GraspObject | None] = MappingProxyType(

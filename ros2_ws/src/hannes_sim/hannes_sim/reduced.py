@@ -152,7 +152,7 @@ class ReducedPlant:
             # opening that is left equals the object's size.
             self.parameters[_OBJECT_K] = grasp.stiffness * travel**2
             self.parameters[_OBJECT_B] = grasp.damping * travel**2
-            self.parameters[_OBJECT_AT] = values.value("hand.travel") - grasp.size / travel
+            self.parameters[_OBJECT_AT] = (values.value("hand.opening") - grasp.size) / travel
         self.reset()
 
     def _update_inertia(self) -> None:
