@@ -31,6 +31,7 @@ CLOCK = "rosgraph_msgs/msg/Clock"
 
 _LITTLE = b"\x00\x01"
 _ENDIAN = {b"\x00\x01": "<", b"\x00\x00": ">"}
+_TIME = {_LITTLE: struct.Struct("<iI"), b"\x00\x00": struct.Struct(">iI")}
 _MAX_LAYOUTS = 256
 _MAX_JOINTS = 4096
 
@@ -291,6 +292,35 @@ def _each(raw: RawTopic, index: int, read: Any) -> Any:
         return read(_Cursor(raw.message(index)))
     except CdrError as error:
         raise CdrError(error.what, index) from None
+
+
+def stamp_at(data: bytes) -> int | None:
+    """The stamp (ns) at the beginning of a message: of a header, or of a Clock; None if it is not CDR."""
+    layout = _TIME.get(bytes(data[:2]))
+    if layout is None or len(data) < 12:
+        return None
+    seconds, nanoseconds = layout.unpack_from(data, 4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def shift_stamp(data: bytes, by_ns: int) -> bytes:
+    """The message with the stamp at its beginning moved by so many ns; a zero stamp (not stamped) stays."""
+    layout, stamp = _TIME.get(bytes(data[:2])), stamp_at(data)
+    if layout is None or not stamp:
+        return data
+    seconds, nanoseconds = divmod(stamp + by_ns, 1_000_000_000)
+    if not -(2**31) <= seconds < 2**31:
+        return data
+    return data[:4] + layout.pack(seconds, nanoseconds) + data[12:]
+
+
+@cache
+def stamped_types() -> frozenset[str]:
+    """Message types of ROS 2 Jazzy that begin with a std_msgs/Header."""
+    fields = typestore().fielddefs
+    return frozenset(
+        name for name, (_, members) in fields.items() if members and members[0][1][1] == "std_msgs/msg/Header"
+    )
 
 
 def encode_float64(values: npt.ArrayLike) -> list[bytes]:

@@ -188,23 +188,32 @@ class BagWriter:
             self._topics[topic].channel_id, log_ns, log_ns if publish_ns is None else publish_ns, data
         )
 
-    def flush(self, *, to_disk: bool = False) -> None:
-        """Hand all messages so far to the operating system; `to_disk` also waits until the disk has them."""
+    def flush(self) -> None:
+        """Hand all messages so far to the operating system, so that a kill cannot take them."""
         try:
             self._mcap.end_chunk()
             self._stream.flush()
-            if to_disk:
-                os.fdatasync(self._stream.fileno())
         except OSError as error:
             raise HannesError(f"Cannot write the bag {self.path}: {error.strerror or error}.") from None
 
-    def close(self) -> None:
-        """Write the index and metadata.yaml; harmless if called again."""
+    def sync(self) -> None:
+        """Wait until the disk has what was handed over; may be called from another thread than the others."""
+        if not self._stream.closed:
+            os.fdatasync(self._stream.fileno())
+
+    def close(self, more_metadata: Mapping[str, Any] | None = None) -> None:
+        """Write the index and metadata.yaml; harmless if called again.
+
+        more_metadata  what is known only now, such as what was lost
+        """
         if self._closed:
             return
         self._closed = True
         try:
             self._mcap.end_chunk()
+            if more_metadata:
+                self._custom |= encode_entries(more_metadata)
+                self._mcap.add_metadata(MCAP_METADATA, self._custom)
             information = self._information()
             text = yaml.safe_dump(
                 {"rosbag2_bagfile_information": information}, sort_keys=False, allow_unicode=True

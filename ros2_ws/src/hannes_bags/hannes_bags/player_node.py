@@ -1,0 +1,151 @@
+"""player: plays a bag onto its topics, with /clock."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from time import monotonic
+
+from hannes_description.errors import HannesError
+from hannes_ros import topics
+from hannes_ros.convert import clock_bytes
+from hannes_ros.node import DEFAULT_NAMESPACE, HannesNode
+from hannes_ros.node_parameters import declare, parameter
+from hannes_ros.run import run_node
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from .player import CLOCK_TOPIC, Schedule, load_playlist
+from .recorder_node import message_class
+from .storage import TopicEntry
+from .writing import Qos
+
+_STEP_S = 0.001
+_CLOCK_S = 0.01
+_TICKS_AT_ONCE = 100
+_DEPTH = 2000
+
+
+@dataclass(frozen=True)
+class PlayerParameters:
+    """ROS parameters of player."""
+
+    bag: str = parameter("", "the bag to play: a folder, a .mcap or a .db3 file")
+    rate: float = parameter(1.0, "played seconds in a second", lower=1e-3, upper=1e3)
+    fast: bool = parameter(False, "as fast as the subscribers take it, instead of at `rate`")
+    topics: tuple[str, ...] = parameter((), "topics to play; empty for all")
+    start: float = parameter(0.0, "time to skip at the beginning", lower=0.0, upper=1e6, unit="s")
+    loop: bool = parameter(False, "begin again at the end; simulated time goes on")
+    clock: bool = parameter(True, "publish /clock with the bag's times")
+    subscribers: int = parameter(
+        0, "subscribers that each played topic must have before the first message", lower=0, upper=100
+    )
+    wait: float = parameter(10.0, "how long to wait for them", lower=0.0, upper=1e4, unit="s")
+
+    def __post_init__(self) -> None:
+        if not self.bag:
+            raise HannesError("Parameter 'bag' is empty; give the bag to play: -p bag:=FOLDER.")
+
+
+class PlayerNode(HannesNode, Node):
+    """Publishes a bag's messages as they lie in it, serialised."""
+
+    node_name = "player"
+    parameters = PlayerParameters
+
+    def __init__(self, cli_args: list[str] | None = None) -> None:
+        super().__init__(self.node_name, namespace=DEFAULT_NAMESPACE, cli_args=cli_args)
+        self._p = p = declare(self, PlayerParameters)
+        playlist = load_playlist(p.bag, topics=p.topics, start=p.start)
+        self._schedule = Schedule(playlist, 0.0 if p.fast else p.rate, loop=p.loop)
+        self._outputs = {entry.name: self._publisher(entry) for entry in playlist.topics}
+        self._sim_clock: Publisher | None = topics.clock_publisher(self) if p.clock else None
+        self._began: float | None = None
+        self._created = monotonic()
+        self._clocked = 0.0
+        self._count = 0
+        self._last_ns = -1
+        self.wall_timer(_STEP_S, self._step)
+        self.get_logger().info(
+            f"playing {len(playlist.entries)} messages on {len(self._outputs)} topics, {playlist.duration:.3f} s"
+        )
+
+    def _publisher(self, entry: TopicEntry) -> Publisher:
+        offered = Qos.from_text(entry.offered_qos)
+        reliable = offered.reliability != "best_effort"
+        latched = offered.durability == "transient_local"
+        profile = QoSProfile(
+            depth=_DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        return self.create_publisher(message_class(entry.type), entry.name, profile)
+
+    def _step(self) -> None:
+        """What is due now."""
+        if self.done or not self._ready():
+            return
+        now = monotonic()
+        elapsed = now - (self._began or now)
+        ticks = self._schedule.due(elapsed, _TICKS_AT_ONCE)
+        for stamp_ns, messages in ticks:
+            self._tell_time(stamp_ns, now)
+            for topic, data in messages:
+                self._outputs[topic].publish(data)
+            self._count += len(messages)
+        if self._p.fast:
+            self._wait_for_subscribers()
+        elif now - self._clocked > _CLOCK_S and not self._schedule.done:
+            self._tell_time(self._schedule.time_at(elapsed), now)
+        if self._schedule.done:
+            self.done = True
+
+    def _ready(self) -> bool:
+        """Whether every topic has its subscribers; the time of playing begins then."""
+        if self._began is not None:
+            return True
+        if self._p.subscribers:
+            missing = [
+                topic
+                for topic, output in self._outputs.items()
+                if output.get_subscription_count() < self._p.subscribers
+            ]
+            if missing:
+                if monotonic() - self._created > self._p.wait:
+                    self.fail(
+                        f"After {self._p.wait:g} s there are not {self._p.subscribers} subscribers of "
+                        f"{', '.join(missing)}."
+                    )
+                return False
+        self._began = monotonic()
+        return True
+
+    def _tell_time(self, stamp_ns: int, now: float) -> None:
+        if self._sim_clock is not None and stamp_ns > self._last_ns:
+            self._sim_clock.publish(clock_bytes(stamp_ns))
+            self._last_ns, self._clocked = stamp_ns, now
+
+    def _wait_for_subscribers(self) -> None:
+        """As fast as they take it: a reliable writer would overwrite what a slow reader has not
+        acknowledged."""
+        for output in self._outputs.values():
+            output.wait_for_all_acked(Duration(seconds=1))
+
+    def stop(self) -> None:
+        """Let the last messages arrive."""
+        self._wait_for_subscribers()
+        self.get_logger().info(f"played {self._count} messages")
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run_node("hannes_bags.player_node:PlayerNode"))
+
+
+__all__ = ["CLOCK_TOPIC", "PlayerNode", "PlayerParameters", "main"]
+
+
+if __name__ == "__main__":
+    main()

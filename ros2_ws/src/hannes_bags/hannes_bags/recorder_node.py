@@ -1,0 +1,313 @@
+"""recorder: puts the topics of the hand into a bag that a kill cannot rob of more than 0.2 s."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from hannes_description.errors import HannesError
+from hannes_description.signals import SIGNALS
+from hannes_ros.node import DEFAULT_NAMESPACE, HannesNode
+from hannes_ros.node_parameters import declare, parameter
+from hannes_ros.run import run_node
+from hannes_ros.topics import CLOCK_TOPIC, DIAGNOSTICS_TOPIC
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+
+from .recorder import Recorder, SimulatedTimes
+from .writing import BagWriter, Qos
+
+_POLL_S = 0.004
+_LOOK_S = 0.05
+_SYNC_S = 1.0
+_DEPTH = 4000
+_MOST_AT_ONCE = 5000
+_LEADING = SIGNALS["encoder_position"].topic
+_TYPES = {
+    **{signal.topic: signal.type for signal in SIGNALS.values()},
+    CLOCK_TOPIC: "rosgraph_msgs/msg/Clock",
+    DIAGNOSTICS_TOPIC: "diagnostic_msgs/msg/DiagnosticArray",
+}
+
+
+@dataclass(frozen=True)
+class RecorderParameters:
+    """ROS parameters of recorder."""
+
+    output: str = parameter("", "folder of the new bag; it must not exist")
+    topics: tuple[str, ...] = parameter(
+        (), "topics to record; empty for those of the hand, /clock and /diagnostics"
+    )
+    metadata: str = parameter(
+        "", "what the bag shall say of itself, as a JSON object (condition, object, seed ...)"
+    )
+    clock: str = parameter(
+        "auto",
+        "what the log times count: simulated is /clock as it stood when a message was sent, computer is when it was "
+        "received; auto is simulated if somebody publishes /clock or use_sim_time is set",
+        choices=("auto", "computer", "simulated"),
+    )
+    compression: str = parameter("none", "packing of the bag's chunks", choices=("none", "zstd"))
+    flush_ms: float = parameter(
+        50.0, "how often messages are handed to the operating system", lower=1.0, upper=100.0, unit="ms"
+    )
+
+    def __post_init__(self) -> None:
+        if not self.output:
+            raise HannesError(
+                "Parameter 'output' is empty; give the folder of the new bag: -p output:=FOLDER."
+            )
+        if Path(self.output).exists():
+            raise HannesError(
+                f"{self.output} exists already; a bag is never overwritten. Choose another name."
+            )
+        self.entries()
+
+    def entries(self) -> dict[str, Any]:
+        """The metadata as an object."""
+        try:
+            value = json.loads(self.metadata or "{}")
+        except (ValueError, RecursionError) as error:
+            raise HannesError(f"Parameter 'metadata' is not JSON: {error}.") from None
+        if not isinstance(value, dict):
+            raise HannesError('Parameter \'metadata\' must be a JSON object, such as {"condition": "slow"}.')
+        return value
+
+
+def message_class(msgtype: str) -> type:
+    """The Python class of a type such as std_msgs/msg/Float64; HannesError if its package is not
+    installed."""
+    package, middle, name = ([*msgtype.split("/"), "", ""])[:3]
+    try:
+        if middle != "msg":
+            raise ImportError(msgtype)
+        kind: type = getattr(import_module(f"{package}.msg"), name)
+        return kind
+    except (ImportError, AttributeError):
+        raise HannesError(f"The message type {msgtype!r} is not installed here.") from None
+
+
+class RecorderNode(HannesNode, Node):
+    """Records serialised messages as they come; takes them itself, because no executor tells when they were
+    sent."""
+
+    node_name = "recorder"
+    parameters = RecorderParameters
+
+    def __init__(self, cli_args: list[str] | None = None) -> None:
+        super().__init__(self.node_name, namespace=DEFAULT_NAMESPACE, cli_args=cli_args)
+        self._p = p = declare(self, RecorderParameters)
+        names = p.topics or tuple(dict.fromkeys((*_TYPES,)))
+        known = {self.resolve_topic_name(name): msgtype for name, msgtype in _TYPES.items()}
+        self._leading = self.resolve_topic_name(_LEADING)
+        self._wanted: dict[str, str | None] = {
+            topic: known.get(topic) for topic in (self.resolve_topic_name(name) for name in names)
+        }
+        # A node of its own that no executor serves: executors take messages without their times.
+        self._ears = Node(
+            f"_{self.get_name()}_input",
+            namespace=self.get_namespace(),
+            context=self.context,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
+        self._subscriptions_by_topic: dict[str, Subscription] = {}
+        self._clock = self.resolve_topic_name(CLOCK_TOPIC)
+        self._health = self.resolve_topic_name(DIAGNOSTICS_TOPIC)
+        self._decided = p.clock != "auto"
+        self._simulated = p.clock != "computer"
+        if p.clock == "auto" and self.get_parameter("use_sim_time").value:
+            self._decided = True
+        self._seen_at: float | None = None
+        self._settled_at: float | None = None
+        self._leading_at = 0.0
+        self._matched = 0
+        self._recorder: Recorder | None = None
+        self._begun: set[str] = set()
+        self._stop_sync = threading.Event()
+        self._sync = threading.Thread(target=self._keep_on_disk, name="sync", daemon=True)
+        self._look()
+        self.wall_timer(_LOOK_S, self._look)
+        self.wall_timer(_POLL_S, self._listen)
+        self.wall_timer(p.flush_ms / 1e3, self._flush)
+        self.get_logger().info(f"recording {len(self._wanted)} topics into {p.output}")
+
+    # -- subscriptions ---------------------------------------------------------------------------------------------
+    def _look(self) -> None:
+        """Subscribe to what there is; the leading topic last, since in lock-step it starts the run."""
+        if not self._decided:
+            self._decide()
+        for topic, msgtype in self._wanted.items():
+            if topic == self._leading and not self._may_lead():
+                continue
+            if topic not in self._subscriptions_by_topic:
+                self._subscribe(topic, msgtype)
+            elif self._unheard(topic):
+                self._ears.destroy_subscription(self._subscriptions_by_topic.pop(topic))
+                self._subscribe(topic, msgtype)
+
+    def _decide(self) -> None:
+        """Whether there is simulated time: a publisher of /clock says yes, signals for 0.1 s without one say no."""
+        if self.count_publishers(self._clock):
+            self._decided = True
+            return
+        if self._seen_at is None and (self._begun - {self._health} or self.count_publishers(self._leading)):
+            self._seen_at = time.monotonic()
+        if self._seen_at is not None and time.monotonic() - self._seen_at > 0.1:
+            self._decided, self._simulated = True, False
+            if self._recorder is not None:
+                self._recorder.use_receive_times(time.time_ns())
+
+    def _may_lead(self) -> bool:
+        """With simulated time: 0.4 s after the last match with another publisher, at most 3 s after its own."""
+        if self._leading in self._subscriptions_by_topic or (self._decided and not self._simulated):
+            return True
+        if not self.count_publishers(self._leading):
+            self._settled_at = None
+            return False
+        others = [topic for topic in self._wanted if topic not in (self._leading, self._health)]
+        matched = sum(
+            1
+            for topic in others
+            if topic in self._subscriptions_by_topic
+            and self._subscriptions_by_topic[topic].get_publisher_count()
+        )
+        now = time.monotonic()
+        if self._settled_at is None:
+            self._settled_at, self._matched, self._leading_at = now, matched, now
+        if matched != self._matched:
+            self._settled_at, self._matched = now, matched
+        if not self._decided:
+            return False
+        return now - self._settled_at > 0.4 or now - self._leading_at > 3.0
+
+    def _subscribe(self, topic: str, msgtype: str | None) -> None:
+        if msgtype is None:
+            types = dict(self.get_topic_names_and_types()).get(topic)
+            if not types:
+                return
+            msgtype = self._wanted[topic] = types[0]
+        offered = self.get_publishers_info_by_topic(topic)
+        best_effort = any(info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in offered)
+        reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+        self._subscriptions_by_topic[topic] = self._ears.create_subscription(
+            message_class(msgtype),
+            topic,
+            _never_called,
+            QoSProfile(depth=_DEPTH, reliability=reliability),
+            raw=True,
+        )
+
+    def _unheard(self, topic: str) -> bool:
+        """Whether there are only publishers that a reliable subscription cannot hear."""
+        subscription = self._subscriptions_by_topic[topic]
+        if subscription.get_publisher_count() or not self.count_publishers(topic):
+            return False
+        offered = self.get_publishers_info_by_topic(topic)
+        reliable = subscription.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+        return reliable and all(i.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for i in offered)
+
+    # -- messages --------------------------------------------------------------------------------------------------
+    def _listen(self) -> None:
+        self._poll()
+
+    def _poll(self) -> int:
+        """Take what has come in; how many messages."""
+        taken = 0
+        try:
+            for topic, subscription in self._subscriptions_by_topic.items():
+                taken += self._take(topic, subscription)
+        except HannesError as error:
+            self.fail(error)
+        return taken
+
+    def _take(self, topic: str, subscription: Subscription) -> int:
+        handle, kind = subscription.handle, subscription.msg_type
+        for count in range(_MOST_AT_ONCE):
+            with handle:
+                message = handle.take_message(kind, True)
+            if message is None:
+                return count
+            if topic not in self._begun:
+                self._begin(topic)
+            assert self._recorder is not None
+            data, info = message
+            self._recorder.take(topic, data, info, time.time_ns())
+        return _MOST_AT_ONCE
+
+    def _begin(self, topic: str) -> None:
+        """The first message of a topic; of the first topic, the bag."""
+        msgtype = self._wanted[topic]
+        assert msgtype is not None
+        if self._recorder is None:
+            writer = BagWriter(self._p.output, self._p.entries(), compression=self._p.compression)  # type: ignore[arg-type]
+            self._recorder = Recorder(writer, SimulatedTimes(self._clock) if self._simulated else None)
+            self._sync.start()
+        self._recorder.writer.add_topic(topic, msgtype, qos=self._offered(topic))
+        self._begun.add(topic)
+
+    def _offered(self, topic: str) -> Qos:
+        for info in self.get_publishers_info_by_topic(topic):
+            profile = info.qos_profile
+            return Qos(profile.reliability.name.lower(), profile.durability.name.lower())
+        return Qos()
+
+    def _flush(self) -> None:
+        if self._recorder is None:
+            return
+        try:
+            self._recorder.hand_over(time.time_ns())
+        except HannesError as error:
+            self.fail(error)
+
+    def _keep_on_disk(self) -> None:
+        """A power failure takes at most a second; in a thread, since a disk may be slow."""
+        while not self._stop_sync.wait(_SYNC_S):
+            if self._recorder is not None:
+                self._recorder.writer.sync()
+
+    def stop(self) -> None:
+        """Take what is still on its way, close the bag, tell what is in it."""
+        while self.failure is None and self._poll():
+            time.sleep(0.02)
+        self._stop_sync.set()
+        if self._sync.is_alive():
+            self._sync.join(timeout=5.0)
+        if self._recorder is None:
+            self.get_logger().warning("no message came: there is no bag")
+        else:
+            self._close(self._recorder)
+        self._ears.destroy_node()
+
+    def _close(self, recorder: Recorder) -> None:
+        try:
+            recorder.close(time.time_ns())
+        except HannesError as error:
+            self.fail(error)
+            return
+        lost: Mapping[str, int] = recorder.losses.lost
+        if lost:
+            self.get_logger().warning(f"messages that never arrived: {dict(lost)}")
+        self.get_logger().info(f"{recorder.writer.message_count} messages in {self._p.output}")
+
+
+def _never_called(data: bytes) -> None:
+    raise AssertionError("the input node is in no executor")
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run_node("hannes_bags.recorder_node:RecorderNode"))
+
+
+if __name__ == "__main__":
+    main()
