@@ -11,7 +11,7 @@ export VENV
 .PHONY: help setup demo test check bench build lock rosdep clean distclean
 
 help: ## list these commands
-	@sed -n 's/^\([a-z]*\):.*## /make \1  |/p' $(MAKEFILE_LIST) | column -t -s '|' 2>/dev/null || grep '##' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: ## make or update .venv (each command below does so first; free when nothing changed)
 	@command -v $(or $(PYTHON),python3) >/dev/null || { echo "set-up: $(or $(PYTHON),python3) not found: install Python 3.11 or 3.12 (apt install python3 python3-venv)" >&2; exit 2; }
