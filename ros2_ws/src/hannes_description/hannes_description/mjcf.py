@@ -224,7 +224,7 @@ def build_spec(parameters: Parameters, variant: Variant | Mapping[str, Any] | No
 def _add_materials(spec: mujoco.MjSpec) -> None:
     for name, rgba, shininess in (("shell", (0.80, 0.81, 0.83, 1), 0.5), ("palm", (0.24, 0.26, 0.30, 1), 0.3),
                                   ("joint", (0.14, 0.15, 0.17, 1), 0.6), ("pad", (0.90, 0.54, 0.30, 1), 0.1),
-                                  ("object", (0.24, 0.55, 0.72, 1), 0.4)):
+                                  ("object", (0.24, 0.55, 0.72, 0.80), 0.4)):
         spec.add_material(name=name, rgba=list(rgba), shininess=shininess, specular=shininess)
 
 
@@ -281,8 +281,8 @@ def _add_shape(body: Any, link: Link) -> None:
     _visual(body, mujoco.mjtGeom.mjGEOM_CYLINDER, "joint", size=[0.80 * link.radius, 0, 0],
             fromto=[0, -1.06 * link.radius, 0, 0, 1.06 * link.radius, 0])
     if link.overhang:
-        _visual(body, mujoco.mjtGeom.mjGEOM_ELLIPSOID, "pad", pos=[0.32 * link.radius, 0, link.length - 0.003],
-                size=[0.78 * link.radius, 0.80 * link.radius, 1.25 * link.radius])
+        _visual(body, mujoco.mjtGeom.mjGEOM_ELLIPSOID, "pad", pos=[0.30 * link.radius, 0, link.length - 0.004],
+                size=[0.76 * link.radius, 0.74 * link.radius, 1.25 * link.radius])
 
 
 def _scalar(element: Any, name: str, number: float) -> None:
