@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Sequence
 
+import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 from hannes_description.errors import HannesError
 from hannes_ros.run import USAGE_ERROR, run_node
 
@@ -34,7 +35,7 @@ def chosen(argv: Sequence[str]) -> tuple[list[str], list[str]]:
     unknown = [name for name in names if name not in NODES]
     if unknown:
         raise HannesError(f"There is no node '{unknown[0]}' to compose; valid are {', '.join(NODES)}.")
-    return names, arguments[:at] + arguments[at + 2:]
+    return names, arguments[:at] + arguments[at + 2 :]
 
 
 def main(argv: Sequence[str] | None = None) -> None:

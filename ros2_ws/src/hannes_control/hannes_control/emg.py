@@ -1,9 +1,9 @@
 """Two-channel surface EMG to a position reference, and EMG to try it with.
 
 The way of a published Hannes controller (thesis P13: two sites, 300 Hz): each channel is rectified and low-pass
-filtered to an envelope; the hand closes while the flexor's envelope exceeds a threshold and opens while the extensor's does and
-exceeds the flexor's; a speed proportional to the envelope is integrated into a position reference limited to the hand's
-travel. Both channels high at once (co-contraction) is not a movement but a switch event.
+filtered to an envelope; the hand closes while the flexor's envelope exceeds a threshold and opens while the extensor's
+does and exceeds the flexor's; a speed proportional to the envelope is integrated into a position reference limited to
+the hand's travel. Both channels high at once (co-contraction) is not a movement but a switch event.
 
 Signals that are envelopes already (electrodes that rectify and smooth) may be given as they are: rectifying a positive
 signal changes nothing and the low-pass only adds its delay. `full_scale` is the envelope of a full contraction; all

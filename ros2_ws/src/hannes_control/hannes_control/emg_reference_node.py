@@ -8,6 +8,7 @@ from collections import deque
 from dataclasses import dataclass
 from time import monotonic
 
+import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 from hannes_description.errors import HannesError
 from hannes_ros import convert, topics
 from hannes_ros.diagnostics import OK, WARN, Diagnostics, Health
@@ -70,8 +71,8 @@ class EmgReferenceNode(HannesNode, Node):
         self._reference = topics.publisher(self, "reference_position")
         self._lockstep = p.clock == "lockstep"
         self._peers = Peers({"a subscriber of reference_position": (self._reference.get_subscription_count, 1)})
-        for number, name in enumerate(("emg_flexor", "emg_extensor")):
-            topics.subscription(self, name, lambda data, number=number: self._on_emg(number, data))
+        topics.subscription(self, "emg_flexor", lambda data: self._on_emg(0, data))
+        topics.subscription(self, "emg_extensor", lambda data: self._on_emg(1, data))
         if self._lockstep:
             topics.subscription(self, "encoder_position", self._on_tick_state)
             self.wall_timer(_CHECK_S, self._check)
@@ -138,7 +139,7 @@ class EmgReferenceNode(HannesNode, Node):
             self._answer()
 
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
-        values = {"reference_rad": f"{self._emg.reference:.6g}", "switch_events": self._switches,
+        values: dict[str, object] = {"reference_rad": f"{self._emg.reference:.6g}", "switch_events": self._switches,
                   "samples": self._taken}
         if self._lockstep and (missing := self._peers.missing()):
             return WARN, f"waiting for {', '.join(missing)}", values

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
+import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 from hannes_description.errors import HannesError
 from hannes_ros import convert, topics
 from hannes_ros.diagnostics import OK, WARN, Diagnostics, Health
@@ -25,7 +26,8 @@ class EmgSourceParameters:
     """ROS parameters of emg_source."""
 
     file: str = parameter("", "CSV file with columns t_s, close, open; empty for synthetic EMG")
-    rate: int = parameter(300, "rate of the samples; a file of another rate is resampled", lower=100, upper=2000, unit="Hz")
+    rate: int = parameter(300, "rate of the samples; a file of another rate is resampled", lower=100, upper=2000,
+                          unit="Hz")
     clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
     seed: int = parameter(0, "seed of the synthetic EMG", lower=0, upper=2**31)
     closures: int = parameter(1, "closures of the synthetic EMG", lower=1, upper=100000)
@@ -33,7 +35,8 @@ class EmgSourceParameters:
     hold_time: float = parameter(1.0, "rest between closing and opening", lower=0.0, upper=100.0, unit="s")
     open_time: float = parameter(1.6, "contraction of the extensor", lower=0.1, upper=100.0, unit="s")
     rest_time: float = parameter(0.8, "rest after opening", lower=0.0, upper=100.0, unit="s")
-    cocontraction_time: float = parameter(0.0, "contraction of both after each closure", lower=0.0, upper=100.0, unit="s")
+    cocontraction_time: float = parameter(0.0, "contraction of both after each closure", lower=0.0, upper=100.0,
+                                          unit="s")
     amplitude: float = parameter(1.0, "mean rectified value of a full contraction", lower=1e-6, upper=100.0, unit="V")
 
     def recording(self) -> EmgRecording:
@@ -114,7 +117,7 @@ class EmgSource(HannesNode, Node):
             self.fail(f"The EMG stopped: {self._loop.error!r}")
 
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
-        values = {"samples": len(self._samples), "sent": self._sent, "missed_cycles": self._loop.missed}
+        values: dict[str, object] = {"samples": len(self._samples), "sent": self._sent, "missed_cycles": self._loop.missed}
         if self._lockstep and (missing := self._peers.missing()):
             return WARN, f"waiting for {', '.join(missing)}", values
         return OK, "running" if self._sent < len(self._samples) else "played to the end: rest", values

@@ -1,4 +1,4 @@
-"""motor_controller: the double PID as a lifecycle node; motor/state, motor/current and a reference in, motor/voltage out."""
+"""motor_controller: the double PID as a lifecycle node; state, current and reference in, motor/voltage out."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass
 from time import monotonic
 
+import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_ros import convert, topics
@@ -35,7 +36,8 @@ class MotorControllerParameters:
     reference: str = parameter("topic", "topic, or a profile of its own from the activation on",
                                choices=("topic", *PROFILES))
     reference_closures: int = parameter(1, "closures of the profile", lower=1, upper=100000)
-    reference_amplitude: float = parameter(FULL_CLOSURE, "amplitude of the profile", lower=1e-3, upper=100.0, unit="rad")
+    reference_amplitude: float = parameter(FULL_CLOSURE, "amplitude of the profile", lower=1e-3, upper=100.0,
+                                           unit="rad")
     reference_period: float = parameter(0.0, "period of the profile, 0 for its own", lower=0.0, upper=1e3, unit="s")
     state_timeout_ms: float = parameter(50.0, "age of motor/state or motor/current from which the command is 0 V",
                                         lower=1.0, upper=1e4, unit="ms")
@@ -253,7 +255,7 @@ class MotorController(HannesNode, LifecycleNode):
 
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         self._health.last_input = self._state_at or None
-        values = {"missed_cycles": self._missed + (self._loop.missed if self._loop else 0), "active": self._active,
+        values: dict[str, object] = {"missed_cycles": self._missed + (self._loop.missed if self._loop else 0), "active": self._active,
                   "battery_saver": self._pid.saving, "reference_age_s": f"{monotonic() - self._reference_at:.3f}"
                   if self._reference_at else ""}
         if not self._active:

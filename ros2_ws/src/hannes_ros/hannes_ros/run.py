@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from hannes_description.errors import HannesError
 
+from .early import leave_at_once
+
 if TYPE_CHECKING:
     from rclpy.context import Context
     from rclpy.executors import Executor
@@ -34,18 +36,13 @@ def run_node(*names: str, executor: str = "events", argv: Sequence[str] | None =
     0 after SIGINT, SIGTERM or the end of the work, 2 after a HannesError or a failure.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _leave_at_once)
+        signal.signal(number, leave_at_once)
     arguments = list(sys.argv if argv is None else argv)
     try:
         return _run(names, executor, arguments)
     except HannesError as error:
         print(f"{os.path.basename(arguments[0])}: {error}", file=sys.stderr, flush=True)
         return USAGE_ERROR
-
-
-def _leave_at_once(number: int, frame: object) -> None:
-    """Before the nodes spin, nothing has been driven or written: there is nothing to put away."""
-    os._exit(0)
 
 
 def _load(name: str) -> Any:

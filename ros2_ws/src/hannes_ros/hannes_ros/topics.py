@@ -67,7 +67,8 @@ def qos(name: str) -> QoSProfile:
 
 
 def publisher(node: Node, name: str, on_match: Callable[[Any], None] | None = None) -> Publisher:
-    """Publisher of the signal's topic, relative to the node's namespace; `on_match` is told of new subscribers."""
+    """Publisher of the signal's topic, relative to the node's namespace; `on_match` is told of new and
+    lost subscribers."""
     events = PublisherEventCallbacks(matched=on_match) if on_match else None
     return node.create_publisher(message_type(name), signal(name).topic, qos(name), event_callbacks=events)
 
@@ -80,9 +81,10 @@ def subscription(node: Node, name: str, callback: Callable[[bytes], None],
                                     event_callbacks=events, raw=True)
 
 
-def clock_publisher(node: Node) -> Publisher:
-    """Publisher of simulated time."""
-    return node.create_publisher(Clock, CLOCK_TOPIC, CLOCK_QOS)
+def clock_publisher(node: Node, on_match: Callable[[Any], None] | None = None) -> Publisher:
+    """Publisher of simulated time; `on_match` is told of new and lost subscribers."""
+    events = PublisherEventCallbacks(matched=on_match) if on_match else None
+    return node.create_publisher(Clock, CLOCK_TOPIC, CLOCK_QOS, event_callbacks=events)
 
 
 def diagnostics_publisher(node: Node) -> Publisher:

@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass, replace
 from time import monotonic
 
+import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
@@ -42,7 +43,8 @@ class HandSimParameters:
     clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
     period: float = parameter(1e-3, "control period", lower=1e-4, upper=1e-1, unit="s")
     command_timeout_ms: float = parameter(90.0, "0 V this long after the last command (realtime); in lockstep the "
-                                          "wait for a command after which it is reported", lower=1.0, upper=1e4, unit="ms")
+                                          "wait for a command after which it is reported", lower=1.0, upper=1e4,
+                                          unit="ms")
     duration: float = parameter(0.0, "simulated time after which the node ends, 0 for never", lower=0.0, upper=1e6,
                                 unit="s")
     joint_states_rate: float = parameter(100.0, "rate of joint_states and grip_force", lower=1.0, upper=1e4, unit="Hz")
@@ -55,14 +57,13 @@ class HandSimParameters:
     def grasp(self) -> GraspObject | None:
         """The object to grasp, None for the empty hand."""
         named = named_object(self.object)
-        given = {name: value for name, value in (("size", self.object_size), ("stiffness", self.object_stiffness))
-                 if value > 0.0}
         if named is None:
-            if given:
+            if self.object_size or self.object_stiffness:
                 raise HannesError("Parameters object_size and object_stiffness need an object; set object to soft or "
                                   "rigid.")
             return None
-        return replace(named, **given)
+        return replace(named, size=self.object_size or named.size,
+                       stiffness=self.object_stiffness or named.stiffness)
 
 
 class HandSim(HannesNode, Node):
@@ -97,6 +98,7 @@ class HandSim(HannesNode, Node):
         self._force = topics.publisher(self, "grip_force")
         self._last: tuple[bytes, bytes] = (b"", b"")
         self._lockstep = p.clock == "lockstep"
+        self._clock_heard = False
         on_voltage = self._on_tick_voltage if self._lockstep else self._on_voltage
         self._voltage = topics.subscription(self, "motor_voltage", on_voltage)
         self._peers = Peers({
@@ -108,11 +110,12 @@ class HandSim(HannesNode, Node):
         self._loop = RealtimeLoop(p.period, self._step)
         self.wall_timer(_CHECK_S, self._check_lockstep if self._lockstep else self._check_realtime)
         if self._lockstep:
-            self._sim_clock = topics.clock_publisher(self)
+            self._sim_clock = topics.clock_publisher(self, self._on_clock_match)
         else:
             self._loop.start()
         held = "nothing" if p.object == "none" else f"a {p.object} object"
-        self.get_logger().info(f"model {model.name}, plant {model.plant}, holding {held}, {p.clock}, {1 / p.period:g} Hz")
+        self.get_logger().info(f"model {model.name}, plant {model.plant}, holding {held}, {p.clock}, "
+                               f"{1 / p.period:g} Hz")
 
     def stop(self) -> None:
         """End the real-time loop; let the last messages arrive."""
@@ -130,12 +133,12 @@ class HandSim(HannesNode, Node):
             current, effort = current + noise, effort + self._torque_constant * noise
         state = convert.MOTOR_STATE.encode(stamp_ns, (reading.position,), (reading.velocity,), (effort,))
         self._last = state, convert.float64_bytes(current)
+        self._state.publish(state)  # first: most of the graph waits for it
+        self._current.publish(self._last[1])
         if self._tick % self._slow_every == 0:
             self._joints.publish(convert.FINGER_STATES.encode(stamp_ns, reading.joint_positions.tolist(),
                                                               reading.joint_velocities.tolist()))
             self._force.publish(convert.float64_bytes(reading.grip_force))
-        self._current.publish(self._last[1])
-        self._state.publish(state)
         self._health.cycles += 1
 
     def _advance(self, voltage: float, periods: int) -> bool:
@@ -157,7 +160,7 @@ class HandSim(HannesNode, Node):
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         gate, now = self._gate, monotonic()
         self._health.last_input = gate.last_command
-        values = {"tick": self._tick, "missed_cycles": self._loop.missed, "command_timeouts": gate.timeouts,
+        values: dict[str, object] = {"tick": self._tick, "missed_cycles": self._loop.missed, "command_timeouts": gate.timeouts,
                   "rejected_commands": gate.rejected, "clamped_commands": gate.clamped, "stalls": self._watch.stalls,
                   "applied_voltage": f"{gate.voltage(now) if not self._lockstep else 0.0:.6g}"}
         if not self._lockstep:
@@ -194,12 +197,16 @@ class HandSim(HannesNode, Node):
         if status.current_count_change > 0:  # type: ignore[attr-defined]
             self._watch.newcomer()
 
+    def _on_clock_match(self, status: object) -> None:
+        self._clock_heard = status.current_count > 0  # type: ignore[attr-defined]
+
     def _voltage_publishers(self) -> int:
         return self.count_publishers(self._voltage.topic_name)
 
     def _publish_tick(self) -> None:
         stamp_ns = stamp_of_tick(self._tick, self._period_ns)
-        self._sim_clock.publish(convert.clock_bytes(stamp_ns))
+        if self._clock_heard:
+            self._sim_clock.publish(convert.clock_bytes(stamp_ns))
         self._waiting = True
         self._watch.published(monotonic())
         self._publish(stamp_ns)
@@ -228,8 +235,8 @@ class HandSim(HannesNode, Node):
         before = self._watch.stalls
         if self._watch.check(monotonic()):
             state, current = self._last
-            self._current.publish(current)
             self._state.publish(state)
+            self._current.publish(current)
         if self._watch.stalls > before:
             self.get_logger().warning(f"waiting for motor/voltage of tick {self._tick}")
             self._diagnostics.publish()
