@@ -1,0 +1,118 @@
+"""Lock-step: the node graph, the composed graph and the rollout give the same trajectory."""
+
+from __future__ import annotations
+
+import signal
+
+import numpy as np
+import pytest
+from graph import NodeProcess, processes
+from hannes_control.double_pid import DoublePID
+from hannes_control.emg import SyntheticEmg, emg_reference, synthesise
+from hannes_control.reference import half_sine
+from hannes_description.model import Model
+from hannes_ros import convert
+from hannes_sim.factory import make_plant
+from hannes_sim.objects import named_object
+from hannes_sim.rollout import Rollout, rollout
+
+SECONDS = 0.8
+TICKS = 800
+SIGNALS = ("encoder_position", "motor_current", "motor_voltage", "reference_position")
+
+
+def in_process(reference: np.ndarray, grasp: str) -> Rollout:
+    model = Model.load("nominal")
+    return rollout(make_plant(model, named_object(grasp)), DoublePID.of_model(model.parameters), reference)
+
+
+def columns(peer) -> dict[str, np.ndarray]:
+    """The heard signals as arrays."""
+    states = [convert.MOTOR_STATE.decode(data) for data in peer.heard["encoder_position"]]
+    out = {name: np.array([convert.float64_value(data) for data in peer.heard[name]]) for name in SIGNALS[1:]}
+    out["stamp_ns"] = np.array([state.stamp_ns for state in states])
+    out["encoder_position"] = np.array([state.position[0] for state in states])
+    out["encoder_velocity"] = np.array([state.velocity[0] for state in states])
+    return out
+
+
+def run_graph(peer, *nodes: NodeProcess) -> dict[str, np.ndarray]:
+    """Run until hand_sim, the last of the nodes, has ended; what was heard."""
+    for name in SIGNALS:
+        peer.heard.setdefault(name, []).clear()
+    with processes(*nodes):
+        peer.until(lambda: nodes[-1].process.poll() is not None, what="the end of hand_sim")
+        assert nodes[-1].wait() == 0, nodes[-1].output
+        peer.until(lambda: len(peer.heard["motor_voltage"]) >= TICKS, timeout=5.0, what="all voltages")
+        for node in nodes[:-1]:
+            node.send(signal.SIGINT)
+        assert [node.wait() for node in nodes[:-1]] == [0] * (len(nodes) - 1)
+        assert not [node.output for node in nodes if "Traceback" in node.output]
+    return columns(peer)
+
+
+def assert_equal(heard: dict[str, np.ndarray], expected: Rollout) -> None:
+    np.testing.assert_array_equal(heard["stamp_ns"], np.arange(TICKS) * 1_000_000)
+    for name in ("encoder_position", "encoder_velocity", "motor_current", "motor_voltage"):
+        np.testing.assert_array_equal(heard[name], expected.signal(name), err_msg=name)
+
+
+@pytest.mark.parametrize("kind", ["processes", "composed"])
+def test_simulator_and_controller_equal_the_rollout_bit_for_bit_twice(peer, kind):
+    peer.hear(*SIGNALS)
+    # One more subscriber than the loop needs: the peer must not miss the first tick.
+    sim = {"clock": "lockstep", "duration": SECONDS, "subscribers": 2, "object": "soft"}
+    control = {"clock": "lockstep", "reference": "half_sine", "reference_period": 1.6}
+    runs = []
+    for _ in range(2):
+        if kind == "processes":
+            nodes = [NodeProcess("motor_controller", **control), NodeProcess("hand_sim", **sim)]
+        else:
+            parameters = {f"hand_sim:{k}": v for k, v in sim.items()} | {f"motor_controller:{k}": v
+                                                                      for k, v in control.items()}
+            nodes = [NodeProcess("composed", "--nodes", "hand_sim,motor_controller", **parameters)]
+        runs.append(run_graph(peer, *nodes))
+    for name, values in runs[0].items():
+        np.testing.assert_array_equal(values, runs[1][name], err_msg=name)
+    assert_equal(runs[0], in_process(half_sine(period=1.6)[:TICKS], "soft"))
+    assert runs[0]["motor_voltage"].max() > 1.0
+
+
+@pytest.mark.parametrize("kind", ["processes", "composed"])
+def test_the_whole_chain_from_emg_equals_the_rollout(peer, kind):
+    peer.hear(*SIGNALS)
+    emg = synthesise(SyntheticEmg(), seed=5)
+    samples = [k * 300 // 1000 for k in range(TICKS)]  # the last sample with a time <= k ms
+    reference = emg_reference(emg.flexor, emg.extensor).reference[samples]
+    assert reference[-1] > 1.0
+    own = {"hand_sim": {"duration": SECONDS, "subscribers": 4}, "emg_source": {"seed": 5}, "emg_reference": {},
+           "motor_controller": {}}
+    if kind == "processes":
+        order = ("emg_source", "emg_reference", "motor_controller", "hand_sim")
+        nodes = [NodeProcess(name, clock="lockstep", **own[name]) for name in order]
+    else:
+        nodes = [NodeProcess("composed", clock="lockstep", **{f"{node}:{k}": v for node, values in own.items()
+                                                              for k, v in values.items()})]
+    heard = run_graph(peer, *nodes)
+    np.testing.assert_allclose(heard["reference_position"], reference, rtol=0, atol=1e-12)
+    assert_equal(heard, in_process(heard["reference_position"], "none"))
+
+
+def test_a_killed_controller_stops_time_and_its_successor_goes_on(peer):
+    peer.hear(*SIGNALS)
+    peer.hear_diagnostics()
+    control = {"clock": "lockstep", "reference": "half_sine"}
+    sim = NodeProcess("hand_sim", clock="lockstep", duration=1e5, subscribers=2)
+    first = NodeProcess("motor_controller", **control)
+    with processes(sim, first):
+        peer.until(lambda: len(peer.heard["motor_voltage"]) > 500, what="commands")
+        first.send(signal.SIGKILL)
+        status = peer.until_status("hand_sim", lambda s: s["message"].startswith("waiting"), "the report of the stall")
+        assert int(status["stalls"]) >= 1
+        stopped = len(peer.heard["encoder_position"])
+        peer.spin(0.3)
+        assert len(peer.heard["encoder_position"]) == stopped
+        with processes(NodeProcess("motor_controller", **control)):
+            peer.until(lambda: len(peer.heard["encoder_position"]) > stopped + 300, what="the loop going on")
+        stamps = columns(peer)["stamp_ns"]
+        assert set(np.diff(stamps)) <= {0, 1_000_000}  # no tick is skipped; one may be repeated to the newcomer
