@@ -1,46 +1,87 @@
-"""`hannes record` and `hannes play`: the recorder and the player of hannes_bags, with options instead of parameters."""
+"""`hannes record` and `hannes play`: the nodes of hannes_bags with options for parameters; and `hannes recover`."""
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from .output import JsonOption, print_json
+
+TopicOption = Annotated[
+    list[str] | None, typer.Option("--topic", help="Only this topic; may be given several times.")
+]
+MoreArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="[NAME:=VALUE]...", help="More parameters of the node.")
+]
 
 
 def record(
     output: Annotated[Path, typer.Argument(help="Folder of the new bag; it must not exist.")],
-    arguments: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[NAME:=VALUE]...", help="More parameters of the recorder node."),
-    ] = None,
+    condition: Annotated[str, typer.Option(help="What was done, for instance slow, fast or grasp.")] = "",
+    object: Annotated[str, typer.Option(help="What the hand closed on.")] = "",
+    topic: TopicOption = None,
+    more: MoreArgument = None,
 ) -> None:
     """Record the topics of the hand into a bag (MCAP, safe against a crash); Ctrl-C ends it."""
-    _run("recorder", {"output": str(output.absolute())}, arguments or [])
+    import json
+
+    said = {key: text for key, text in (("condition", condition), ("object", object)) if text}
+    parameters: dict[str, Any] = {"output": str(output.absolute())}
+    if said:
+        parameters["metadata"] = json.dumps(said)
+    if topic:
+        parameters["topics"] = topic
+    _become("recorder", parameters, more or [])
 
 
 def play(
-    bag: Annotated[Path, typer.Argument(help="The bag: a rosbag2 folder or an .mcap file.")],
-    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Speed relative to the recording.")] = 1.0,
-    arguments: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[NAME:=VALUE]...", help="More parameters of the player node."),
-    ] = None,
+    bag: Annotated[Path, typer.Argument(help="The bag: a rosbag2 folder, an .mcap or a .db3 file.")],
+    rate: Annotated[float, typer.Option(min=0.001, max=1000.0, help="Played seconds in a second.")] = 1.0,
+    fast: Annotated[bool, typer.Option("--fast", help="As fast as the subscribers can follow.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
+    start: Annotated[float, typer.Option(min=0.0, help="Time to skip at the beginning, s.")] = 0.0,
+    topic: TopicOption = None,
+    more: MoreArgument = None,
 ) -> None:
     """Play a bag back onto its topics, with /clock."""
-    _run("player", {"bag": str(bag.absolute()), "rate": rate}, arguments or [])
+    parameters: dict[str, Any] = {"bag": str(bag.absolute()), "rate": rate, "start": start}
+    parameters |= {name: True for name, wanted in (("fast", fast), ("loop", loop)) if wanted}
+    if topic:
+        parameters["topics"] = topic
+    _become("player", parameters, more or [])
 
 
-def _run(executable: str, parameters: dict[str, object], more: list[str]) -> None:
-    """Become the node, in the namespace of the hand."""
+def recover(
+    bag: Annotated[Path, typer.Argument(help="The damaged bag: a folder, an .mcap or a .db3 file.")],
+    output: Annotated[Path, typer.Argument(help="Folder of the new bag; it must not exist.")],
+    json: JsonOption = False,
+) -> None:
+    """Save what can be read of a cut or damaged bag into a new one, and verify it."""
+    from hannes_bags.recover import recover as save
+
+    saved = save(bag, output)
+    if json:
+        print_json(saved.as_dict())
+        return
+    typer.echo(f"{saved.output}: {saved.messages} messages, {saved.duration:.3f} s saved from {saved.source}")
+    typer.echo(f"about {saved.lost_s:.3f} s lost at the end ({saved.unread_bytes} bytes could not be read)")
+    for line in saved.damage:
+        typer.echo(f"damage: {line}")
+
+
+def _become(executable: str, parameters: dict[str, Any], more: list[str]) -> None:
+    """Turn this process into the node."""
+    import json
+
     from hannes_bringup.environment import require_ros, ros_environment
     from hannes_bringup.ros2_standin import find_command, parse_launch_arguments
 
     require_ros()
     environment = ros_environment()
-    words = ["--ros-args", "-r", "__ns:=/hannes"]
+    words = ["--ros-args"]
     for name, value in parameters.items():
         words += ["-p", f"{name}:={json.dumps(value)}"]
     for name, text in parse_launch_arguments(more).items():
