@@ -55,7 +55,9 @@ def _describe(item: Field[Any]) -> str:
 
 
 def _descriptor(item: Field[Any]) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=_describe(item), read_only=True)
+    # rclpy takes an empty list for bytes; the type of what the user gave is checked by `declare`
+    empty_list = item.default == ()
+    descriptor = ParameterDescriptor(description=_describe(item), read_only=True, dynamic_typing=empty_list)
     lower, upper = item.metadata["lower"], item.metadata["upper"]
     if isinstance(item.default, float) and (lower is not None or upper is not None):
         descriptor.floating_point_range = [FloatingPointRange(
