@@ -32,7 +32,10 @@ ClosuresOption = Annotated[
 HandsOption = Annotated[
     int, typer.Option(help="Hands of the population; 1 is the model as it is.", min=1, max=100_000)
 ]
-ModelOption = Annotated[str, typer.Option(help="Model by name or path of a model file.")]
+ModelOption = Annotated[
+    list[str],
+    typer.Option(help="Model by name or path of a model file; give several to draw from each in turn."),
+]
 JobsOption = Annotated[int, typer.Option(help="Processes; the result does not depend on it.", min=1, max=256)]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 ClassifierOption = Annotated[str, typer.Option(help="Trained classifier (.onnx); empty: the one installed.")]
@@ -47,7 +50,7 @@ def dataset(
     seed: SeedOption = 1,
     closures: ClosuresOption = 1200,
     hands: HandsOption = 1,
-    model: ModelOption = "nominal",
+    model: ModelOption = ["nominal"],  # noqa: B006 (typer copies it)
     jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -60,7 +63,7 @@ def dataset(
         as_json,
         lambda: print(
             f"{closures} closures ({_listed(made.manifest['kinds'])}) of {hands} hand(s), "
-            f"model {made.manifest['model']}: {path} ({path.stat().st_size / 1e6:.1f} MB)"
+            f"model {', '.join(made.manifest['models'])}: {path} ({path.stat().st_size / 1e6:.1f} MB)"
         ),
     )
 
@@ -76,7 +79,7 @@ def train(
     ] = None,
     closures: ClosuresOption = 1200,
     hands: HandsOption = 1,
-    model: ModelOption = "nominal",
+    model: ModelOption = ["nominal"],  # noqa: B006 (typer copies it)
     jobs: JobsOption = 1,
     current: Annotated[str, typer.Option(help="Current as the feature: rectified or signed.")] = "rectified",
     trees: Annotated[int, typer.Option(help="Trees in the bag.", min=1, max=1000)] = 30,
@@ -91,11 +94,14 @@ def train(
 
     spec, settings = FeatureSpec(current=current), TreeSettings(trees=trees, leaves=leaves)
     training = Dataset.load(data) if data else _simulate("training", closures, seed, hands, model, jobs)
-    count = max(60, len(training.closures) // 4)
-    held_out = {
-        "held_out_objects": _simulate("held-out objects", count, seed + _HELD_OUT_SEED, 1, model, jobs),
-        "held_out_hands": _simulate("held-out hands", count, seed + 2 * _HELD_OUT_SEED, count, model, jobs),
-    }
+    count = max(60, len(training.closures) // (4 * len(model)))
+    held_out = {}
+    for name in model:
+        for what, step, count_of_hands in (("objects", 1, 1), ("hands", 2, count)):
+            title = f"held_out_{what}, {Model.load(name).name}"
+            held_out[title] = _simulate(
+                title, count, seed + step * _HELD_OUT_SEED, count_of_hands, [name], jobs
+            )
     path = train_trees(training, out, seed=seed, spec=spec, settings=settings, held_out=held_out, say=_say)
     manifest = dict(StiffnessClassifier.load(path).manifest)
     _show({"file": str(path), **manifest}, as_json, lambda: _print_training(path, manifest))
@@ -132,12 +138,13 @@ def evaluate(
     )
 
 
-def _simulate(what: str, closures: int, seed: int, hands: int, model: str, jobs: int) -> Dataset:
+def _simulate(what: str, closures: int, seed: int, hands: int, names: Sequence[str], jobs: int) -> Dataset:
     from .dataset import draw_scenes, make_dataset
 
-    scenes = draw_scenes(closures, seed, hands=hands)
+    models = [Model.load(name) for name in names]
+    scenes = draw_scenes(closures, seed, hands=hands, models=[model.name for model in models])
     with _progress(what) as progress:
-        return make_dataset(scenes, Model.load(model), seed=seed, jobs=jobs, progress=progress)
+        return make_dataset(scenes, *models, seed=seed, jobs=jobs, progress=progress)
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from hannes_description.parameters import data_path, read_yaml
 from hannes_description.signals import STIFFNESS_CLASSES
 from hannes_sim.factory import make_plant
 from hannes_sim.measurement import THESIS, Sensors
-from hannes_sim.objects import SHAPES, GraspObject
+from hannes_sim.objects import SHAPES, SOFT_BALL, GraspObject
 from hannes_sim.rollout import rollout
 from numpy.typing import NDArray
 
@@ -41,13 +41,15 @@ Array = NDArray[np.float64]
 _ARRAYS = ("time", "current", "reference", "encoder", "force")
 VOID, RIGID, SOFT = STIFFNESS_CLASSES
 
-RIGID_FROM = 3700.0
-"""N/m of one fingertip's contact from which an object is rigid: 92 N of total finger force (R13) shared by
-five fingers, 18.5 N each, press it by the 5 mm of P18."""
+RIGID_FROM = 18_400.0
+"""N/m of the whole grasp from which an object is rigid: 92 N of total finger force (R13) press it by the 5 mm
+of P18."""
 STIFFNESS: Mapping[str, tuple[float, float]] = {SOFT: (200.0, 1500.0), RIGID: (20e3, 100e3)}
 """Range of the drawn stiffness, N/m: around the thesis' two, soft about 0.4 kN/m and rigid at least 40 kN/m."""
-SIZES = (0.025, 0.065)
-"""Range of the drawn object sizes, m."""
+SIZES = (0.050, 0.085)
+"""Range of the drawn object sizes, m: what a closure of the bench test touches before its end."""
+PLACES = {SOFT_BALL.shape: SOFT_BALL.place}
+"""Place of the drawn objects by shape, m: where the fingers reach a sphere; the middle of the grasp otherwise."""
 AMPLITUDES = (0.85, 1.0)
 """Range of the drawn reference amplitudes, parts of the full closure (P17)."""
 PERIODS = (3.5, 4.5)
@@ -65,6 +67,7 @@ class Scene:
     grasp      the object, or None for a closure on nothing
     amplitude  rad at the pulley; period s of the half-sine reference (X01)
     hand       number of the hand of the population; 0 is the model as it is
+    model      name of the model; empty for the only one
     """
 
     object: str
@@ -73,6 +76,7 @@ class Scene:
     amplitude: float = FULL_CLOSURE
     period: float = 4.0
     hand: int = 0
+    model: str = ""
 
     def __post_init__(self) -> None:
         if self.kind not in STIFFNESS_CLASSES:
@@ -89,6 +93,7 @@ class Scene:
             "amplitude": self.amplitude,
             "period": self.period,
             "hand": self.hand,
+            "model": self.model,
         }
 
     @classmethod
@@ -117,20 +122,27 @@ def kind_of(grasp: GraspObject | None) -> str:
     return RIGID if grasp.stiffness >= RIGID_FROM else SOFT
 
 
-def draw_scenes(closures: int, seed: int, *, hands: int = 1) -> tuple[Scene, ...]:
-    """`closures` scenes, a third of each kind in turn; every closure has an object and a reference of its own."""
-    if closures < 1 or hands < 1:
-        raise HannesError(f"A data set needs at least one closure and one hand, not {closures} and {hands}.")
+def draw_scenes(
+    closures: int, seed: int, *, hands: int = 1, models: Sequence[str] = ("",)
+) -> tuple[Scene, ...]:
+    """`closures` scenes, kinds, models and hands in turn; every one has an object and a reference of its own."""
+    if closures < 1 or hands < 1 or not models:
+        raise HannesError(
+            f"A data set needs at least one closure, hand and model, not {closures}, {hands} and {len(models)}."
+        )
     scenes = []
     for k in range(closures):
+        # Of each scene's own generator, so that more closures do not change the first ones.
         rng = np.random.default_rng([seed, 0, k])
         kind = STIFFNESS_CLASSES[k % len(STIFFNESS_CLASSES)]
         grasp = None
         if kind != VOID:
             low, high = STIFFNESS[kind]
             stiffness = float(np.exp(rng.uniform(math.log(low), math.log(high))))
+            shape = SHAPES[int(rng.integers(len(SHAPES)))]
             grasp = GraspObject(
-                shape=SHAPES[int(rng.integers(len(SHAPES)))],
+                shape=shape,
+                place=PLACES.get(shape, (0.0, 0.0, 0.0)),
                 size=float(rng.uniform(*SIZES)),
                 stiffness=stiffness,
                 damping=DAMPING_TIME * stiffness,
@@ -142,7 +154,8 @@ def draw_scenes(closures: int, seed: int, *, hands: int = 1) -> tuple[Scene, ...
                 grasp=grasp,
                 amplitude=FULL_CLOSURE * float(rng.uniform(*AMPLITUDES)),
                 period=float(rng.uniform(*PERIODS)),
-                hand=k // len(STIFFNESS_CLASSES) % hands,
+                hand=k // len(STIFFNESS_CLASSES) // len(models) % hands,
+                model=models[k // len(STIFFNESS_CLASSES) % len(models)],
             )
         )
     return tuple(scenes)
@@ -293,47 +306,46 @@ def _npz_path(path: str | Path) -> Path:
 
 def make_dataset(
     scenes: Sequence[Scene],
-    model: Model,
-    *,
+    *models: Model,
     seed: int,
     sensors: Sensors = THESIS,
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Dataset:
-    """Simulate the scenes, each with its own hand of the population.
+    """Simulate the scenes, each with its model and its hand of the population.
 
+    models    the models that the scenes name; a scene without a name takes the first
     seed      fixes the hands and the noise (the scenes are given)
     jobs      processes; the result does not depend on it
     progress  told how many closures of how many are done
     """
-    models = {hand: hand_of(model, hand, seed) for hand in sorted({scene.hand for scene in scenes})}
-    work = [(scene, models[scene.hand], sensors, seed, index) for index, scene in enumerate(scenes)]
+    named = {model.name: model for model in models}
+    if not models or len(named) < len(models):
+        raise HannesError(f"The models {[model.name for model in models]} need a name of their own each.")
+    unknown = sorted({scene.model for scene in scenes} - {*named, ""})
+    if unknown:
+        raise HannesError(f"Scenes name the model '{unknown[0]}'; there is {', '.join(named)}.")
+    named[""] = models[0]
+    hands = {(s.model, s.hand): hand_of(named[s.model], s.hand, seed) for s in scenes}
+    work = [(s, hands[s.model, s.hand], sensors, seed, index) for index, s in enumerate(scenes)]
     done: list[Closure] = []
     for closure in _run(work, jobs):
         done.append(closure)
         if progress is not None:
             progress(len(done), len(work))
-    return Dataset(
-        tuple(done),
-        {
-            "schema": SCHEMA,
-            "seed": seed,
-            "model": model.name,
-            "model_sha256": model.sha256,
-            "plant": model.plant,
-            "effects": [effect.name for effect in model.effects],
-            "hands": len(models),
-            "closures": len(done),
-            "kinds": {kind: sum(s.kind == kind for s in scenes) for kind in STIFFNESS_CLASSES},
-            "sensors": sensors.to_dict(),
-            "ranges": {
-                "stiffness": dict(STIFFNESS),
-                "size": SIZES,
-                "amplitude": AMPLITUDES,
-                "period": PERIODS,
-            },
+    manifest = {
+        "schema": SCHEMA,
+        "seed": seed,
+        "models": {
+            m.name: {"sha256": m.sha256, "plant": m.plant, "effects": [e.name for e in m.effects]}
+            for m in models
         },
-    )
+        "hands": len({scene.hand for scene in scenes}),
+        "closures": len(done),
+        "kinds": {kind: sum(s.kind == kind for s in scenes) for kind in STIFFNESS_CLASSES},
+        "sensors": sensors.to_dict(),
+    }
+    return Dataset(tuple(done), manifest)
 
 
 def _run(work: Sequence[tuple[Scene, Model, Sensors, int, int]], jobs: int) -> Iterable[Closure]:

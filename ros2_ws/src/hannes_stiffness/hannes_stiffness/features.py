@@ -34,12 +34,12 @@ CURRENTS = ("rectified", "signed")
 
 GAP = 0.25
 """Longest hole in a stream that is still one stream, s."""
-_AVERAGED = 0.9
+_AVERAGED = 0.885
 """Part of the sampling period that is averaged: below 1, so that jitter does not put two slow samples into
-one mean."""
-_EARLY = 0.25
+one mean, and no multiple of a millisecond at 30 Hz, so that rounding of the stamps decides nothing."""
+_EARLY = 0.245
 """Part of the sampling period by which a sample may come early and still be taken (jitter of a stream at
-its own rate)."""
+its own rate); no multiple of a millisecond either."""
 _RISES, _RESTS = 0.5, 0.05
 """Rates of the reference, rad/s, above which a closure starts and below which the next one may start
 (hysteresis)."""

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import monotonic
 
 from hannes_description.errors import HannesError
-from hannes_description.joints import ENCODER_JOINT
 from hannes_description.signals import STIFFNESS_CLASSES
-from hannes_ros.convert import JointCodec, JointSample, float64_bytes, float64_value
+from hannes_ros.convert import MOTOR_STATE, JointSample, float64_bytes, float64_value
 from hannes_ros.diagnostics import OK, WARN, Diagnostics, Health
 from hannes_ros.lockstep import TickJoin
+from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
 from hannes_ros.topics import publisher, subscription
@@ -28,8 +28,11 @@ from .classifier import StiffnessClassifier
 from .features import FeatureStream, believable
 
 _STATE, _CURRENT, _REFERENCE = range(3)
-_LONGEST_QUEUE = 5000
-"""Messages after which a lock-step topic that stays silent is given up and the join begins anew."""
+_LONGEST_QUEUE = 4000
+"""Messages without a whole tick after which lock-step is joined anew; most currents kept between two states.
+
+More than three topics can hold in their queues: after a slow start these come topic by topic.
+"""
 
 
 @dataclass(frozen=True)
@@ -43,25 +46,30 @@ class StiffnessParameters:
     timeout: float = parameter(
         0.25, "Age of current or reference from which there is no answer", lower=0.01, upper=10.0, unit="s"
     )
-    clock: str = parameter("realtime", "How messages meet", choices=("realtime", "lockstep"))
+    clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
 
 
-class StiffnessNode(Node):
+class StiffnessNode(HannesNode, Node):
     """Classifies the grasp from the motor's signals."""
 
+    node_name = "stiffness_classifier"
     parameters = StiffnessParameters
 
-    def __init__(self) -> None:
-        super().__init__("stiffness_classifier")
+    def __init__(self, cli_args: Sequence[str] | None = None) -> None:
+        super().__init__(self.node_name, namespace=DEFAULT_NAMESPACE, cli_args=cli_args)
         self._settings = declare(self, StiffnessParameters)
         self._classifier = StiffnessClassifier.load(self._settings.classifier)
         self._stream = FeatureStream(self._classifier.spec, self._settings.rate)
-        self._codec = JointCodec([ENCODER_JOINT], effort=True)
         self._health = Health("not_finite", "unknown_joint", "stale_input", "lost_ticks")
         self._latest: dict[int, tuple[float, float]] = {}
         self._currents: list[float] = []
         self._join = TickJoin(3)
+        # From the first message on, since nothing waits for this node: it may have missed the first ticks, but then of
+        # all topics alike.
+        self._join.synchronise()
         self._queued = 0
+        self._stamp_ns: int | None = None
+        self._period_ns = 0
         self._time = -math.inf
         self._label = ""
         self._probability = publisher(self, "stiffness_probability")
@@ -86,11 +94,12 @@ class StiffnessNode(Node):
     def _state(self, data: bytes) -> None:
         self._health.last_input = monotonic()
         try:
-            sample = self._codec.decode(data)
+            sample = MOTOR_STATE.decode(data)
         except HannesError:
             self._health.count("unknown_joint")
             return
         if self._settings.clock == "lockstep":
+            self._follow(sample.stamp_ns)
             self._tick(_STATE, sample)
             return
         self._time = sample.stamp_ns * 1e-9
@@ -111,18 +120,30 @@ class StiffnessNode(Node):
             return
         self._classify(sample, current, reference)
 
+    def _follow(self, stamp_ns: int) -> None:
+        """Join anew where a tick was lost: after that the order of messages no longer tells what belongs together."""
+        step = 0 if self._stamp_ns is None else stamp_ns - self._stamp_ns
+        self._stamp_ns = stamp_ns
+        if step > 0 and (self._period_ns == 0 or step < self._period_ns):
+            self._period_ns = step
+        elif step < 0 or step > self._period_ns > 0:
+            self._rejoin()
+
+    def _rejoin(self) -> None:
+        self._health.count("lost_ticks")
+        self._join.reset()
+        self._join.synchronise()
+        self._queued = 0
+
     def _tick(self, slot: int, item: JointSample | float) -> None:
         self._join.put(slot, item)
         self._queued += 1
         taken = self._join.take()
         if taken is not None:
-            self._join.synchronise()
             self._queued = 0
             self._classify(*taken)
         elif self._queued > _LONGEST_QUEUE:
-            self._health.count("lost_ticks")
-            self._join.reset()
-            self._queued = 0
+            self._rejoin()
 
     def _classify(self, state: JointSample, current: float, reference: float) -> None:
         encoder = state.position[0]
