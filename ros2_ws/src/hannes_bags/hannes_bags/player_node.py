@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from .player import CLOCK_TOPIC, Schedule, load_playlist
+from .player import Schedule, load_playlist
 from .recorder_node import message_class
 from .storage import TopicEntry
 from .writing import Qos
@@ -143,9 +143,6 @@ class PlayerNode(HannesNode, Node):
 def main() -> None:
     """Run the node."""
     sys.exit(run_node("hannes_bags.player_node:PlayerNode"))
-
-
-__all__ = ["CLOCK_TOPIC", "PlayerNode", "PlayerParameters", "main"]
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ COMMANDS: tuple[Command, ...] = (
         "record", "hannes_bringup.cli.bags:record", "Record the topics of the hand into a crash-safe bag."
     ),
     Command("play", "hannes_bringup.cli.bags:play", "Play a bag back onto the topics, with /clock."),
+    Command("info", "hannes_bags.cli:info", "Show what a bag holds, and that it is intact."),
     Command("recover", "hannes_bringup.cli.bags:recover", "Save what is left of a cut or damaged bag."),
     Command("model", "hannes_bringup.cli.model:app", "Show models: parameters with provenance, effects."),
     Command("stiffness", "hannes_stiffness.cli:app", "Train and test the classifier of the grasped object."),
