@@ -41,7 +41,7 @@ class MotorControllerParameters:
     reference_period: float = parameter(0.0, "period of the profile, 0 for its own", lower=0.0, upper=1e3, unit="s")
     state_timeout_ms: float = parameter(50.0, "age of motor/state or motor/current from which the command is 0 V",
                                         lower=1.0, upper=1e4, unit="ms")
-    pause_limit_ms: float = parameter(80.0, "a pause of the control loop longer than this deactivates the node",
+    pause_limit_ms: float = parameter(100.0, "a pause of the control loop longer than this deactivates the node",
                                       lower=1.0, upper=1e4, unit="ms")
 
     def profile(self) -> Profile | None:

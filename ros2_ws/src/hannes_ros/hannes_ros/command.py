@@ -12,6 +12,7 @@ class CommandGate:
     limit    V, the command is clamped to [-limit, limit]
     timeout  s after the last command, by the caller's clock, from which the output is 0 V
     rejected, clamped, timeouts  counts
+    age_at_zero  s between the last command and the 0 V of the latest timeout; None before the first
     Commands may arrive in another thread than the one that asks for the voltage.
     """
 
@@ -21,6 +22,7 @@ class CommandGate:
         self._voltage = 0.0
         self._last: float | None = None
         self.timed_out = False
+        self.age_at_zero: float | None = None
         self.rejected = self.clamped = self.timeouts = 0
 
     @property
@@ -45,5 +47,6 @@ class CommandGate:
             if self._last is not None and not self.timed_out and now - self._last >= self._timeout:
                 self.timed_out = True
                 self.timeouts += 1
+                self.age_at_zero = now - self._last
                 self._voltage = 0.0
             return self._voltage

@@ -42,7 +42,7 @@ class HandSimParameters:
                                         lower=0.0, upper=1e7, unit="N/m")
     clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
     period: float = parameter(1e-3, "control period", lower=1e-4, upper=1e-1, unit="s")
-    command_timeout_ms: float = parameter(90.0, "0 V this long after the last command (realtime); in lockstep the "
+    command_timeout_ms: float = parameter(80.0, "0 V this long after the last command (realtime); in lockstep the "
                                           "wait for a command after which it is reported", lower=1.0, upper=1e4,
                                           unit="ms")
     duration: float = parameter(0.0, "simulated time after which the node ends, 0 for never", lower=0.0, upper=1e6,
@@ -89,6 +89,7 @@ class HandSim(HannesNode, Node):
         self._waiting = False
         self._timeout_reported = 0
         self._began = 0.0
+        self._applied = 0.0
         self._health = Health("unexpected_commands")
 
         self._watch = StallWatch(p.command_timeout_ms / 1e3)
@@ -160,10 +161,13 @@ class HandSim(HannesNode, Node):
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         gate, now = self._gate, monotonic()
         self._health.last_input = gate.last_command
-        values: dict[str, object] = {"tick": self._tick, "missed_cycles": self._loop.missed, "command_timeouts": gate.timeouts,
-                  "rejected_commands": gate.rejected, "clamped_commands": gate.clamped, "stalls": self._watch.stalls,
-                  "applied_voltage": f"{gate.voltage(now) if not self._lockstep else 0.0:.6g}"}
+        age = "" if gate.age_at_zero is None else f"{gate.age_at_zero:.4f}"
+        values: dict[str, object] = {
+            "tick": self._tick, "missed_cycles": self._loop.missed, "stalls": self._watch.stalls,
+            "rejected_commands": gate.rejected, "clamped_commands": gate.clamped, "command_timeouts": gate.timeouts,
+            "command_age_at_zero_s": age}
         if not self._lockstep:
+            values["applied_voltage"] = f"{self._applied:.6g}"
             if gate.last_command is None:
                 return WARN, "no command yet: 0 V", values
             return (ERROR, "command timed out: 0 V", values) if gate.timed_out else (OK, "running", values)
@@ -180,7 +184,8 @@ class HandSim(HannesNode, Node):
     def _step(self, now: float, elapsed: int) -> None:
         """One period of the real-time thread; periods that were missed are made up for, within reason."""
         self._began = self._began or now
-        if not self.done and self._advance(self._gate.voltage(now),
+        self._applied = self._gate.voltage(now)
+        if not self.done and self._advance(self._applied,
                                            min(elapsed, max(1, round(_LONGEST_CATCH_UP_S / self._p.period)))):
             self._publish(self.get_clock().now().nanoseconds)
 

@@ -1,0 +1,99 @@
+"""hand_sim alone, driven over topics."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from graph import NodeProcess, processes
+from hannes_description.joints import JOINT_NAMES
+from hannes_ros import convert
+
+
+def say_voltage(peer, value: float) -> None:
+    peer.say("motor_voltage", convert.float64_bytes(value))
+
+
+def test_lockstep_advances_one_tick_for_one_voltage(peer):
+    peer.hear("encoder_position", "motor_current", "joint_positions", "grip_force")
+    with processes(NodeProcess("hand_sim", clock="lockstep", duration=0.05)) as (sim,):
+        peer.publisher("motor_voltage")
+        states, currents = peer.heard["encoder_position"], peer.heard["motor_current"]
+        for tick in range(50):
+            peer.until(lambda tick=tick: len(states) == len(currents) == tick + 1, what=f"reading {tick}")
+            assert convert.MOTOR_STATE.decode(states[-1]).stamp_ns == tick * 1_000_000
+            say_voltage(peer, 6.0)
+        assert sim.wait() == 0
+    last = convert.MOTOR_STATE.decode(states[-1])
+    assert last.position[0] > 0.1
+    assert last.velocity[0] > 0.0
+    assert last.effort[0] == pytest.approx(0.01745 * 19 * convert.float64_value(currents[-1]), rel=0.02)
+    fingers = [convert.JointCodec(JOINT_NAMES, effort=False).decode(data) for data in peer.heard["joint_positions"]]
+    assert [sample.stamp_ns for sample in fingers] == [k * 10_000_000 for k in range(5)]
+    assert len(peer.heard["grip_force"]) == 5
+
+
+def test_not_finite_commands_give_zero_volt_and_are_counted_and_large_ones_are_clamped(peer):
+    peer.hear("encoder_position", "motor_current")
+    peer.hear_diagnostics()
+    with processes(NodeProcess("hand_sim", clock="lockstep")):
+        peer.publisher("motor_voltage")
+        states = peer.heard["encoder_position"]
+        commands = [math.nan, math.inf, -math.inf, 1e9]
+        for tick, voltage in enumerate([*commands, 12.0]):
+            peer.until(lambda tick=tick: len(states) == tick + 1, what=f"reading {tick}")
+            say_voltage(peer, voltage)
+        peer.until(lambda: len(states) == 6)
+        status = peer.until_status("hand_sim", lambda s: s["tick"] == "5", "the counts")
+    assert (status["rejected_commands"], status["clamped_commands"]) == ("3", "1")
+    current = [convert.float64_value(data) for data in peer.heard["motor_current"]]
+    assert current[1:4] == [0.0, 0.0, 0.0]
+    assert 0.0 < current[4] < 12.0 / 1.0
+
+
+def test_lockstep_reports_what_it_waits_for_and_ignores_commands_out_of_turn(peer):
+    peer.hear_diagnostics()
+    with processes(NodeProcess("hand_sim", clock="lockstep", subscribers=3)) as (sim,):
+        peer.matched("motor_voltage")
+        say_voltage(peer, 3.0)
+        status = peer.until_status("hand_sim", lambda s: s["unexpected_commands"] == "1")
+        assert "waiting for 3 subscriber(s) of motor/state" in status["message"]
+        assert "waiting for 3 subscriber(s) of motor/state" in sim.output
+        assert status["tick"] == "0"
+
+
+def test_real_time_gives_zero_volt_when_commands_stop(peer):
+    peer.hear("encoder_position", "motor_current")
+    peer.hear_diagnostics()
+    with processes(NodeProcess("hand_sim", clock="realtime", command_timeout_ms=50)):
+        peer.matched("motor_voltage")
+        for _ in range(30):
+            say_voltage(peer, 5.0)
+            peer.spin(0.01)
+        driven = len(peer.heard["motor_current"])
+        assert convert.float64_value(peer.heard["motor_current"][-1]) != 0.0
+        status = peer.until_status("hand_sim", lambda s: s["command_timeouts"] == "1", "the timeout")
+        assert status["applied_voltage"] == "0"
+        assert status["message"] == "command timed out: 0 V"
+        # By the node's own clock, so that the load of the machine does not matter here.
+        assert float(status["command_age_at_zero_s"]) <= 0.1
+        say_voltage(peer, 5.0)
+        peer.until_status("hand_sim", lambda s: s["command_timeouts"] == "2", "a second timeout")
+    states = [convert.MOTOR_STATE.decode(data) for data in peer.heard["encoder_position"]]
+    assert all(b.stamp_ns > a.stamp_ns for a, b in zip(states, states[1:], strict=False))
+    assert len(peer.heard["motor_current"]) > driven
+
+
+def test_noise_is_seeded_and_on_current_and_effort(peer):
+    peer.hear("encoder_position", "motor_current")
+    states, currents = peer.heard["encoder_position"], peer.heard["motor_current"]
+    with processes(NodeProcess("hand_sim", clock="lockstep", duration=0.02, current_noise=0.1, seed=3)) as (sim,):
+        peer.publisher("motor_voltage")
+        for tick in range(20):
+            peer.until(lambda tick=tick: len(states) == len(currents) == tick + 1)
+            say_voltage(peer, 0.0)
+        assert sim.wait() == 0
+    heard = [convert.float64_value(data) for data in currents]
+    assert heard == pytest.approx(0.1 * np.random.default_rng(3).standard_normal(20))
+    assert convert.MOTOR_STATE.decode(states[5]).effort[0] == pytest.approx(0.01745 * 19 * heard[5], rel=0.02)
