@@ -150,6 +150,40 @@ def test_kill_loses_at_most_200_ms(start: Start, tmp_path: Path, ros_context: An
     node.destroy_node()
 
 
+def test_in_lockstep_every_message_has_the_time_of_its_tick(
+    start: Start, tmp_path: Path, ros_context: Any
+) -> None:
+    """Header-less messages too, though thousands of ticks pass in a second and none is missing from the first on."""
+    from hannes_ros import topics
+    from hannes_ros.convert import MOTOR_STATE, clock_bytes, float64_bytes
+    from rclpy.node import Node
+
+    child = start("recorder", output=str(tmp_path / "bag"))
+    node = Node("sim", context=ros_context, namespace="hannes")
+    clock = topics.clock_publisher(node)
+    current, state, reference, voltage = (
+        topics.publisher(node, name)
+        for name in ("motor_current", "encoder_position", "reference_position", "motor_voltage")
+    )
+    settle(lambda: state.get_subscription_count() > 0)
+    for tick in range(2000):
+        stamp, number = tick * 1_000_000, float64_bytes(float(tick))
+        clock.publish(clock_bytes(stamp))
+        current.publish(number)
+        state.publish(MOTOR_STATE.encode(stamp, (float(tick),), (0.0,), (0.0,)))
+        reference.publish(number)
+        voltage.publish(number)
+        time.sleep(2e-4)
+    time.sleep(0.3)
+    output = end(child, signal.SIGINT)
+    back = read_bag(tmp_path / "bag")
+    assert back.start_ns == 0, output
+    for name in ("motor_current", "encoder_position", "reference_position", "motor_voltage"):
+        assert back[name].values.tolist() == np.arange(2000).tolist(), output
+        assert np.array_equal(back[name].time, np.arange(2000) / 1e3)
+    node.destroy_node()
+
+
 def test_best_effort_publishers_are_heard(start: Start, tmp_path: Path, ros_context: Any) -> None:
     from rclpy.node import Node
     from rclpy.qos import QoSProfile, ReliabilityPolicy

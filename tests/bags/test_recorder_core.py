@@ -96,8 +96,10 @@ def test_without_simulated_time_messages_count_when_received(tmp_path: Path) -> 
 
 def test_losses_are_counted_for_one_publisher() -> None:
     counter = LossCounter()
-    for number in (3, 4, 7, 8, None, 10, 1, 2):
+    for number in (3, 4, 7, 8, None, 10, 11):
         counter.saw("a", number)
+    for number in (1, 2, 5, 3, 9):
+        counter.saw("several publishers", number)
     assert counter.lost == {"a": 3}
 
 

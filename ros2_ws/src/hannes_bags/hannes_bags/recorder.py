@@ -90,21 +90,25 @@ class SimulatedTimes:
 class LossCounter:
     """Messages of a topic that were sent but never arrived, by the publisher's numbers.
 
-    Counts for topics with one publisher; where a number comes again or goes back, another publisher is at
-    work and counting begins anew.
+    Only for topics with one publisher: where a number comes again or goes back there are several, whose numbers cannot
+    be told apart, and nothing is said.
     """
 
     last: dict[str, int] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
+    shared: set[str] = field(default_factory=set)
 
     def saw(self, topic: str, number: int | None) -> None:
         """A message with this publication number (1, 2, ...) came in."""
-        if number is None:
+        if number is None or topic in self.shared:
             return
         before = self.last.get(topic)
-        if before is not None and number > before + 1:
-            self.lost[topic] = self.lost.get(topic, 0) + number - before - 1
         self.last[topic] = number
+        if before is not None and number <= before:
+            self.shared.add(topic)
+            self.lost.pop(topic, None)
+        elif before is not None and number > before + 1:
+            self.lost[topic] = self.lost.get(topic, 0) + number - before - 1
 
 
 class Recorder:
