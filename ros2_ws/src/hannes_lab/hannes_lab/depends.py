@@ -36,7 +36,29 @@ class Dependence:
                 "curve": list(self.curve)}
 
 
-def dependences(features: Features, residuals: Mapping[str, list[Array]], states: Mapping[str, list[Array]],
+def residual_dependences(features: Features, predicted: list[Array]) -> tuple[Dependence, ...]:
+    """What the residual of the current (or of the first signal there is) depends on."""
+    residuals: dict[str, list[Array]] = {}
+    states: dict[str, list[Array]] = {"position": [], "velocity": [], "direction": [], "load": []}
+    for block, closures in zip(features.blocks, predicted, strict=True):
+        residuals.setdefault(block.signal, []).append(block.measured - closures)
+    signal = next((s for s in ("motor_current", "motor_effort") if s in residuals), next(iter(residuals)))
+    by = {(b.condition, b.signal): (b, c) for b, c in zip(features.blocks, predicted, strict=True)}
+    for condition in [b.condition for b in features.blocks if b.signal == signal]:
+        target, load = by[(condition, signal)]
+        place = by.get((condition, "encoder_position"))
+        if place is not None:
+            position = np.interp(target.phase, place[0].phase, place[1].mean(axis=0))
+        else:
+            position = load.mean(axis=0)
+        velocity = np.gradient(position, target.phase)
+        for name, values in (("position", position), ("velocity", velocity), ("direction", velocity)):
+            states[name].append(np.tile(values, (target.n, 1)))
+        states["load"].append(load)
+    return _dependences(residuals, states, signal)
+
+
+def _dependences(residuals: Mapping[str, list[Array]], states: Mapping[str, list[Array]],
                 signal: str) -> tuple[Dependence, ...]:
     """Shares of one signal's residual, largest first.
 
@@ -49,7 +71,7 @@ def dependences(features: Features, residuals: Mapping[str, list[Array]], states
         if variable == "time":
             values = np.concatenate([np.repeat(np.linspace(0.0, 1.0, a.shape[0]), a.shape[1])
                                      for a in residuals[signal]])
-            target = np.concatenate([(a - 0.0).ravel() for a in residuals[signal]])
+            target = np.concatenate([a.ravel() for a in residuals[signal]])
         else:
             values = np.concatenate([a.mean(axis=0) for a in states[variable]])
             target = r

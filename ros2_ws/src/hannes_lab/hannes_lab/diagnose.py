@@ -12,7 +12,7 @@ from hannes_sim.effect import catalogue, effect_source, load_effect
 from numpy.typing import NDArray
 
 from .chance import Chance, chance
-from .depends import Dependence, dependences
+from .depends import Dependence, residual_dependences
 from .errors import (
     SignalError,
     held_out_closures,
@@ -21,7 +21,7 @@ from .errors import (
     signal_errors,
 )
 from .experiments import Experiment, separating_experiments
-from .features import Features
+from .features import Features, data_used
 from .fit import Fit
 from .prepare import Prepared
 from .problem import Problem, build_problem
@@ -38,7 +38,7 @@ WORTHWHILE = 0.05
 
 MAX_EFFECTS = 3
 
-WIDE = (6, 4)
+WIDE = (4, 3)
 """How many of the best singles and pairs are extended by every further effect."""
 
 
@@ -161,7 +161,8 @@ def diagnose(prepared: Prepared, sources: Mapping[str, str], *, jobs: int = 1, p
                    if len(tied) > 1 else ())
     return Diagnosis(
         verdict=verdict, summary=_summary(verdict, effects, tied, falls, limits, best), effects=effects, tied=tied,
-        experiments=experiments, falls=falls, ranking=ranking, depends_on=_depends(prepared, best), chance=limits,
+        experiments=experiments, falls=falls, ranking=ranking, depends_on=residual_dependences(prepared.features, prepared.features.closures(
+            prepared.rig, best.fit.model, best.fit.values)), chance=limits,
         costs={"nominal_fitted": null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
         nuisances=_nuisance_table(best.fit), notes=(*prepared.notes, *_identifiability_notes(best)),
         simulations=prepared.problem.simulations, data=data_used(prepared.features), model=model)
@@ -294,33 +295,6 @@ def error_falls(prepared: Prepared, search: Search, best: Candidate, progress: P
     return tuple(falls)
 
 
-def _depends(prepared: Prepared, best: Candidate) -> tuple[Dependence, ...]:
-    features = prepared.features
-    predicted = features.closures(prepared.rig, best.fit.model, best.fit.values)
-    residuals: dict[str, list[Array]] = {}
-    states: dict[str, list[Array]] = {"position": [], "velocity": [], "direction": [], "load": []}
-    for block, closures in zip(features.blocks, predicted, strict=True):
-        residuals.setdefault(block.signal, []).append(block.measured - closures)
-    signals = list(residuals)
-    signal = next((s for s in ("motor_current", "motor_effort") if s in signals), signals[0])
-    by = {(b.condition, b.signal): (b, c) for b, c in zip(features.blocks, predicted, strict=True)}
-    for condition in [b.condition for b in features.blocks if b.signal == signal]:
-        target, load = by[(condition, signal)]
-        place = by.get((condition, "encoder_position"))
-        n = target.n
-        if place is not None:
-            block, closures = place
-            position = np.interp(target.phase, block.phase, closures.mean(axis=0))
-        else:
-            position = load.mean(axis=0)
-        velocity = np.gradient(position, target.phase)
-        states["position"].append(np.tile(position, (n, 1)))
-        states["velocity"].append(np.tile(velocity, (n, 1)))
-        states["direction"].append(np.tile(velocity, (n, 1)))
-        states["load"].append(load)
-    return dependences(features, residuals, states, signal)
-
-
 def _nuisance_table(found: Fit) -> dict[str, dict[str, float]]:
     intervals = intervals_of(found, 1.0)
     return {c.name: {"value": c.value(float(z)), "nominal": c.value(0.0), "prior_sds": float(z),
@@ -365,9 +339,3 @@ def _summary(verdict: str, effects: Sequence[FoundEffect], tied: Sequence[Sequen
     part = f" The catalogue comes nearest with {names}, which is not enough." if names else ""
     return (f"Something is missing that is not in the catalogue: the best model's misfit {best.fit.cost:.0f} stays above "
             f"what chance reaches ({limits.misfit:.0f}).{part} {fall}")
-
-
-def data_used(features: Features) -> tuple[dict[str, Any], ...]:
-    """What data took part: bag, hash, conditions, closures, signals."""
-    return tuple({"name": t.name, "source": t.source, "sha256": t.sha256, "conditions": list(t.conditions),
-                  "closures": len(t.closures), "signals": sorted(t.signals)} for t in features.trials)

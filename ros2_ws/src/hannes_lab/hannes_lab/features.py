@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from hannes_description.errors import HannesError
@@ -204,3 +205,9 @@ def _block(trial: Trial, number: int, condition: str, signal: str, may_compact: 
 
     return Block(number, condition, signal, phase, np.array(measured), stack(full),
                  stack(compact) if compact else None)
+
+
+def data_used(features: Features) -> tuple[dict[str, Any], ...]:
+    """What data took part: bag, hash, conditions, closures, signals."""
+    return tuple({"name": t.name, "source": t.source, "sha256": t.sha256, "conditions": list(t.conditions),
+                  "closures": len(t.closures), "signals": sorted(t.signals)} for t in features.trials)

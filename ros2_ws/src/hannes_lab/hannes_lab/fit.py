@@ -121,7 +121,7 @@ def fit(problem: Problem, model: Model, coordinates: Sequence[Coordinate], start
     found = least_squares(
         lambda z: np.concatenate([residual_at(z)[use], priors * z]), inside,
         jac=lambda z: np.vstack([jacobian_at(z)[use], np.diag(priors)]), bounds=(bounds[0], bounds[1]), method="trf",
-        max_nfev=evaluations, ftol=1e-4, xtol=1e-4, gtol=1e-6, x_scale=1.0)
+        max_nfev=evaluations, ftol=1e-5, xtol=1e-5, gtol=1e-8, x_scale=1.0)
     z = found.x
     r = residual_at(z)
     jacobian = last["jacobian"] if "z" in last and np.allclose(last["z"], z, atol=0.2) else jacobian_at(z)

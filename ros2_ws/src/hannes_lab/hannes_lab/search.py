@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from hannes_description.model import Model
@@ -33,6 +34,15 @@ class Candidate:
     penalised: float
 
 
+KEEP = 1
+"""Points of each scan (from the base fit, and from the nominal values) from which an effect is refitted."""
+
+REFIT = 8
+"""Extensions of a round that are refitted in closed loop."""
+
+POLISH = 3
+"""Extensions of a round that are refitted with all derivatives afresh."""
+
 PENALTY = 4.0
 """Cost of one parameter (Akaike's 2 doubled, since shape parameters are searched over several starts)."""
 
@@ -57,6 +67,7 @@ class Search:
     progress: Progress = silent
     rows: NDArray[np.bool_] | None = None
     found: dict[Names, Candidate] = field(default_factory=dict)
+    _prior_points: dict[Names, Fit] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.coordinates = tuple(nuisance_coordinate(n) for n in self.nuisances)
@@ -82,14 +93,14 @@ class Search:
             coordinates += effect_coordinates(kind)
         return model, tuple(coordinates)
 
-    def starts(self, name: str, base: Fit, model: Model, coordinates: Sequence[Coordinate], keep: int) -> list[dict[str, float]]:
+    def starts(self, name: str, base: Fit, model: Model, coordinates: Sequence[Coordinate], keep: int
+               ) -> list[tuple[float, dict[str, float]]]:
         """Best starting points of one effect on top of a fit, by a scan with the nuisance parameters compensated.
 
         Scans the strength at every start of the shape parameters; what the nuisance parameters could take over is
         projected out linearly.
         """
         own = {c.name: c for c in effect_coordinates(self.effect(name))}
-        here = {c.name: float(z) for c, z in zip(base.coordinates, base.z, strict=True)}
         shapes, strengths = [], []
         for p in self.effect(name).parameters:
             c = own[f"{name}.{p.name}"]
@@ -102,16 +113,35 @@ class Search:
         for shape in itertools.product(*shapes):
             for group in strengths:
                 trials += [dict((*shape, one)) for one in group]
-        scored = []
-        for start in trials:
-            z = {**here, **start}
-            values = {c.name: c.value(z.get(c.name, 0.0)) for c in coordinates}
-            scored.append((self.compensated(self.problem.residual(model, values), base), start))
-        scored.sort(key=lambda item: item[0])
-        return [{**here, **start} for _, start in scored[:keep]]
+        scored: list[list[tuple[float, dict[str, float]]]] = []
+        for point in (base, self.prior_point(base)):
+            here = {c.name: float(z) for c, z in zip(point.coordinates, point.z, strict=True)}
+            scores = []
+            for start in trials:
+                z = {**here, **start}
+                values = {c.name: c.value(z.get(c.name, 0.0)) for c in coordinates}
+                cost, z_base = self.compensated(self.problem.residual(model, values), point)
+                moved = {c.name: float(v) for c, v in zip(point.coordinates, z_base, strict=True)}
+                scores.append((cost, {**moved, **start}))
+            scored.append(sorted(scores, key=lambda item: item[0])[:keep])
+        return sorted((one for scores in scored for one in scores), key=lambda item: item[0])
 
-    def compensated(self, residual: Array, base: Fit) -> float:
-        """Cost of a residual after the linear best move of the base fit's coordinates."""
+    def prior_point(self, base: Fit) -> Fit:
+        """The base's effects with the nuisance parameters back at their nominal values.
+
+        A fit without the true effect may have driven a nuisance parameter far off; the truth is near the prior's mean.
+        """
+        names = tuple(dict.fromkeys(c.name.split(".")[0] for c in base.coordinates if not c.prior))
+        if names not in self._prior_points:
+            z = np.array([0.0 if c.prior else float(v) for c, v in zip(base.coordinates, base.z, strict=True)])
+            values = {c.name: c.value(float(v)) for c, v in zip(base.coordinates, z, strict=True)}
+            r = self.problem.residual(base.model, values)
+            jacobian = finite_differences(self.problem, base.model, base.coordinates, z, r, range(z.size))
+            self._prior_points[names] = Fit(base.model, base.coordinates, z, float(r @ r), r, jacobian)
+        return self._prior_points[names]
+
+    def compensated(self, residual: Array, base: Fit) -> tuple[float, Array]:
+        """Cost of a residual after the linear best move of the base fit's coordinates, and where they move to."""
         use = slice(None) if self.rows is None else self.rows
         jacobian = base.jacobian[use]
         prior = np.array([1.0 if c.prior else 0.0 for c in base.coordinates])
@@ -119,63 +149,75 @@ class Search:
         r = residual[use]
         step = -np.linalg.solve(a, jacobian.T @ r + prior * base.z)
         moved, z = r + jacobian @ step, base.z + step
-        return float(moved @ moved + (prior * z) @ (prior * z))
+        return float(moved @ moved + (prior * z) @ (prior * z)), np.clip(z, -8.0, 8.0)
 
-    def add(self, base: Candidate, name: str, *, keep: int = 2, polish: bool = True) -> Candidate:
-        """Fit the base set plus one effect, from the best points of the scan."""
-        names = (*base.names, name)
-        key = tuple(sorted(names))
-        if key in self.found:
-            return self.found[key]
-        model, coordinates = self.with_effects(names)
+    def add(self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None = None) -> Candidate:
+        """Fit the base set plus one effect, from the best points of the scan (or the given ones)."""
+        model, coordinates = self.with_effects((*base.names, name))
         known = {c.name: base.fit.jacobian[:, j] for j, c in enumerate(base.fit.coordinates) if c.prior}
-        best: Fit | None = None
-        for start in self.starts(name, base.fit, model, coordinates, keep):
-            trial = fit(self.problem, model, coordinates, start, rows=self.rows, known=known, evaluations=12)
-            if best is None or trial.cost < best.cost:
-                best = trial
-        assert best is not None
-        if polish:
-            best = self.polish(best)
+        if starts is None:
+            starts = [start for _, start in self.starts(name, base.fit, model, coordinates, KEEP)]
+        tried = [fit(self.problem, model, coordinates, start, rows=self.rows, known=known, evaluations=10)
+                 for start in starts]
+        return self._keep(base, name, min(tried, key=lambda f: f.cost))
+
+    def _keep(self, base: Candidate, name: str, best: Fit) -> Candidate:
         free = sum(1 for c in best.coordinates if not c.prior)
-        candidate = Candidate(names, best, best.cost + PENALTY * free)
-        self.found[key] = candidate
+        candidate = Candidate((*base.names, name), best, best.cost + PENALTY * free)
+        self.found[tuple(sorted(candidate.names))] = candidate
         return candidate
 
-    def polish(self, found: Fit, evaluations: int = 10) -> Fit:
-        """Refit from a point with all derivatives taken afresh."""
-        again = fit(self.problem, found.model, found.coordinates, found.z, rows=self.rows, evaluations=evaluations)
-        return again if again.cost <= found.cost else found
+    def polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
+        """Refit from the candidate's point with all derivatives taken afresh."""
+        old = candidate.fit
+        new = fit(self.problem, old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
+        if new.cost < old.cost:
+            candidate = Candidate(candidate.names, new, candidate.penalised - old.cost + new.cost)
+            self.found[tuple(sorted(candidate.names))] = candidate
+        return candidate
 
     # -- rounds -------------------------------------------------------------------------------------------------
     def extend(self, bases: Sequence[Candidate], names: Sequence[str], text: str) -> list[Candidate]:
-        """Every base with every further effect, in parallel; sorted by penalised cost."""
-        todo: list[tuple[Candidate, str]] = []
-        seen: set[Names] = set()
+        """The bases with one further effect each, sorted by penalised cost.
+
+        All extensions are scanned; the REFIT most promising are refitted in closed loop, the POLISH best of them with all
+        derivatives taken afresh.
+        """
+        todo: dict[Names, tuple[Candidate, str]] = {}
         for base in bases:
             for name in names:
-                key = tuple(sorted((*base.names, name)))
-                if name not in base.names and key not in seen:
-                    seen.add(key)
-                    if key not in self.found:
-                        todo.append((base, name))
-        done = 0
-        if self.jobs == 1:
-            for base, name in todo:
-                self.add(base, name)
-                done += 1
-                self.progress(done, len(todo), f"{text}: {name}")
-        elif todo:
-            results = Parallel(n_jobs=self.jobs, return_as="generator")(
-                delayed(_add_in_worker)(self.problem, self.model, tuple(self.nuisances), dict(self.sources), self.rows,
-                                        base, name) for base, name in todo)
-            for (base, name), (candidate, simulations, failures) in zip(todo, results, strict=True):
-                self.found[tuple(sorted((*base.names, name)))] = candidate
-                self.problem.simulations += simulations
-                self.problem.failures += failures
-                done += 1
-                self.progress(done, len(todo), f"{text}: {name}")
-        return sorted((self.found[key] for key in seen), key=lambda c: c.penalised)
+                if name not in base.names:
+                    todo.setdefault(tuple(sorted((*base.names, name))), (base, name))
+        scans = self._each(_scan_in_worker, list(todo.values()), f"{text}: scan")
+        order = sorted(zip(todo.values(), scans, strict=True), key=lambda item: item[1][0][0])
+        chosen = [(base, name, [s for _, s in starts]) for (base, name), starts in order[:REFIT]]
+        refitted = self._each(_add_in_worker, chosen, f"{text}: refit")
+        for candidate in refitted:
+            self.found[tuple(sorted(candidate.names))] = candidate
+        ranked = sorted(refitted, key=lambda c: c.penalised)
+        polished = self._each(_polish_in_worker, [(c,) for c in ranked[:POLISH]], f"{text}: polish")
+        for candidate in polished:
+            self.found[tuple(sorted(candidate.names))] = candidate
+        return sorted([*polished, *ranked[POLISH:]], key=lambda c: c.penalised)
+
+    def _each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
+        """function(search, *item) for every item, in this process or in workers; the same results either way."""
+        out = []
+        if self.jobs == 1 or len(items) < 2:
+            for k, item in enumerate(items):
+                out.append(function(self, *item))
+                self.progress(k + 1, len(items), text)
+            return out
+        arguments = (self.problem, self.model, tuple(self.nuisances), dict(self.sources), self.rows)
+        batches = [list(items[k::self.jobs]) for k in range(self.jobs)]
+        results = Parallel(n_jobs=self.jobs)(delayed(_batch)(arguments, function, batch) for batch in batches)
+        merged: list[Any] = [None] * len(items)
+        for k, (part, simulations, failures) in enumerate(results):
+            merged[k::self.jobs] = part
+            self.problem.simulations += simulations
+            self.problem.failures += failures
+        self.progress(len(items), len(items), text)
+        return merged
 
     def signatures(self, base: Candidate) -> dict[str, list[Array]]:
         """Whitened derivative of each effect at vanishing strength, per shape start; for what chance reaches."""
@@ -200,8 +242,22 @@ class Search:
         return out
 
 
-def _add_in_worker(problem: Problem, model: Model, nuisances: tuple[Nuisance, ...], sources: dict[str, str],
-                   rows: NDArray[np.bool_] | None, base: Candidate, name: str) -> tuple[Candidate, int, int]:
+def _batch(arguments: tuple[Any, ...], function: Callable[..., Any], items: list[tuple[Any, ...]]
+           ) -> tuple[list[Any], int, int]:
+    problem, model, nuisances, sources, rows = arguments
     problem.simulations = problem.failures = 0
     search = Search(problem, model, nuisances, sources, rows=rows)
-    return search.add(base, name), problem.simulations, problem.failures
+    return [function(search, *item) for item in items], problem.simulations, problem.failures
+
+
+def _scan_in_worker(search: Search, base: Candidate, name: str) -> list[tuple[float, dict[str, float]]]:
+    model, coordinates = search.with_effects((*base.names, name))
+    return search.starts(name, base.fit, model, coordinates, KEEP)
+
+
+def _add_in_worker(search: Search, base: Candidate, name: str, starts: list[dict[str, float]]) -> Candidate:
+    return search.add(base, name, starts)
+
+
+def _polish_in_worker(search: Search, candidate: Candidate) -> Candidate:
+    return search.polish(candidate)

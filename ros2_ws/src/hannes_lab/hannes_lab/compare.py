@@ -1,0 +1,239 @@
+"""Where the model fails: aligned closures, errors per signal and phase, the thesis' figures, and the residual's pattern."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from hannes_description.model import Model
+from numpy.typing import NDArray
+
+from .depends import Dependence, residual_dependences
+from .errors import UNITS, SignalError, overall, signal_errors
+from .features import Block, Features, data_used
+from .phases import METRICS, PHASES, metrics, phase_of
+from .prepare import Prepared
+from .problem import nuisance_coordinate
+from .fit import fit
+
+Array = NDArray[np.float64]
+
+FALSE_DISCOVERY_RATE = 0.05
+DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One signal in one phase of one condition.
+
+    rmse, repeatability  in unit; ratio of both
+    p_value              chance of such a mean residual if only the scatter between closures were at work
+    fails                beyond chance at a false-discovery rate of 5 % over all cells
+    """
+
+    condition: str
+    signal: str
+    phase: str
+    unit: str
+    rmse: float
+    bias: float
+    repeatability: float
+    ratio: float
+    p_value: float
+    fails: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        return self.__dict__.copy()
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """Mean closure of a signal with its band, the model beside it, and the phase of every instant."""
+
+    condition: str
+    signal: str
+    unit: str
+    time: Array
+    measured: Array
+    low: Array
+    high: Array
+    model: Array
+    reference: Array
+    phase: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        out: dict[str, Any] = {"condition": self.condition, "signal": self.signal, "unit": self.unit,
+                               "phase": list(self.phase)}
+        for name in ("time", "measured", "low", "high", "model", "reference"):
+            out[name] = [float(f"{v:.6g}") for v in getattr(self, name)]
+        return out
+
+
+@dataclass(frozen=True)
+class MetricRow:
+    """One of the thesis' figures: mean over closures, standard deviation, model, relative error in percent (P22)."""
+
+    condition: str
+    name: str
+    unit: str
+    measured: float
+    sd: float
+    model: float
+    relative_error_percent: float
+
+    def to_dict(self) -> dict[str, Any]:
+        return self.__dict__.copy()
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All of it; `to_dict` is what --json and the report show."""
+
+    model: Model
+    fitted: bool
+    errors: tuple[SignalError, ...]
+    overall: float
+    cells: tuple[Cell, ...]
+    overlays: tuple[Overlay, ...]
+    metrics: tuple[MetricRow, ...]
+    depends_on: tuple[Dependence, ...]
+    data: tuple[Mapping[str, Any], ...]
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"model": {"name": self.model.name, "sha256": self.model.sha256}, "fitted": self.fitted,
+                "overall": self.overall, "errors": [e.to_dict() for e in self.errors],
+                "cells": [c.to_dict() for c in self.cells], "overlays": [o.to_dict() for o in self.overlays],
+                "metrics": [m.to_dict() for m in self.metrics],
+                "depends_on": {d.variable: d.to_dict() for d in self.depends_on},
+                "data": [dict(d) for d in self.data], "notes": list(self.notes)}
+
+
+def compare(prepared: Prepared, *, fitted: bool = False, values: Mapping[str, float] | None = None,
+            seed: int = 0) -> Comparison:
+    """Compare the prepared model as it is, or with its nuisance parameters fitted first.
+
+    values  parameters to use instead (those of a diagnosis, with its model in `prepared`)
+    """
+    features, model = prepared.features, prepared.model
+    if values is None:
+        values = {}
+        if fitted:
+            coordinates = [nuisance_coordinate(n) for n in prepared.nuisances]
+            values = fit(prepared.problem, model, coordinates, {}, evaluations=15).values
+    predicted = features.closures(prepared.rig, model, values)
+    contact = _contact(prepared, values)
+    labels = [_labels(features, block, contact) for block in features.blocks]
+    errors = signal_errors(features, predicted)
+    return Comparison(model, fitted, errors, overall(errors), _cells(features, predicted, labels, seed),
+                      tuple(_overlay(features, b, p, lab) for b, p, lab in zip(features.blocks, predicted, labels,
+                                                                              strict=True)),
+                      _metrics(features, predicted, labels), residual_dependences(features, predicted),
+                      data_used(features), prepared.notes)
+
+
+def _contact(prepared: Prepared, values: Mapping[str, float]) -> dict[int, tuple[Array, Array] | None]:
+    """Per trial, when there is contact, on the control grid: from the measured force, else from the model's."""
+    out: dict[int, tuple[Array, Array] | None] = {}
+    for k, trial in enumerate(prepared.features.trials):
+        if "grip_force" in trial.signals:
+            time, force = trial.signals["grip_force"]
+        else:
+            run = prepared.rig.simulate(prepared.model, values, trial, trial.reference)
+            if "grip_force" not in run:
+                out[k] = None
+                continue
+            force = run["grip_force"]
+            time = np.arange(force.size) * trial.period
+        top = float(force.max())
+        out[k] = (time, (force > 0.02 * top).astype(float)) if top > 0.0 else None
+    return out
+
+
+def _labels(features: Features, block: Block, contact: Mapping[int, tuple[Array, Array] | None]) -> NDArray[np.int64]:
+    trial = features.trials[block.trial]
+    closure = trial.of(block.condition)[min(1, len(trial.of(block.condition)) - 1)]
+    touching = contact[block.trial]
+    mask = None
+    if touching is not None:
+        mask = np.interp(closure.start + block.phase, *touching) > 0.5
+    return phase_of(trial, closure, block.phase, mask)
+
+
+def _cells(features: Features, predicted: list[Array], labels: list[NDArray[np.int64]], seed: int) -> tuple[Cell, ...]:
+    rng = np.random.default_rng(seed)
+    rows: list[dict[str, Any]] = []
+    for block, model, label in zip(features.blocks, predicted, labels, strict=True):
+        e = block.measured - block.measured.mean(axis=0)
+        residual = block.measured.mean(axis=0) - model.mean(axis=0)
+        n = block.n
+        for k, name in enumerate(PHASES):
+            own = label == k
+            if own.sum() < 3:
+                continue
+            repeat = float(np.sqrt((e[:, own] ** 2).sum() / max(1, (n - 1) * own.sum()))) if n > 1 else float("nan")
+            rmse = float(np.sqrt(((block.measured - model)[:, own] ** 2).mean()))
+            seen = float((residual[own] ** 2).mean())
+            p = float("nan")
+            if n >= 5:
+                # Means of randomly signed deviations: what the mean residual would be by scatter alone.
+                draws = rng.choice([-1.0, 1.0], size=(DRAWS, n)) @ e[:, own] / n * np.sqrt(n / (n - 1.0))
+                p = float((1 + ((draws**2).mean(axis=1) >= seen).sum()) / (1 + DRAWS))
+            rows.append({"condition": block.condition, "signal": block.signal, "phase": name,
+                         "unit": UNITS.get(block.signal, ""), "rmse": rmse, "bias": float(residual[own].mean()),
+                         "repeatability": repeat, "ratio": rmse / repeat if repeat > 0 else float("nan"), "p_value": p})
+    limit = _benjamini_hochberg([r["p_value"] for r in rows])
+    return tuple(Cell(**r, fails=bool(r["p_value"] <= limit)) for r in rows)
+
+
+def _benjamini_hochberg(p_values: list[float]) -> float:
+    """Largest p-value that is still a discovery (Benjamini, Hochberg 1995); -1 if none is."""
+    p = np.sort([v for v in p_values if np.isfinite(v)])
+    if p.size == 0:
+        return -1.0
+    passed = p <= FALSE_DISCOVERY_RATE * np.arange(1, p.size + 1) / p.size
+    return float(p[passed].max()) if passed.any() else -1.0
+
+
+def _overlay(features: Features, block: Block, predicted: Array, label: NDArray[np.int64]) -> Overlay:
+    trial = features.trials[block.trial]
+    closure = trial.of(block.condition)[0]
+    spread = 2.0 * block.measured.std(axis=0, ddof=1) if block.n > 1 else np.zeros(block.phase.size)
+    mean = block.measured.mean(axis=0)
+    grid = np.arange(trial.reference.size) * trial.period
+    return Overlay(block.condition, block.signal, UNITS.get(block.signal, ""), block.phase, mean, mean - spread,
+                   mean + spread, predicted.mean(axis=0), np.interp(closure.start + block.phase, grid, trial.reference),
+                   tuple(PHASES[k] for k in label))
+
+
+def _metrics(features: Features, predicted: list[Array], labels: list[NDArray[np.int64]]) -> tuple[MetricRow, ...]:
+    out = []
+    for condition in features.conditions:
+        own = [k for k, b in enumerate(features.blocks) if b.condition == condition]
+        first = next((k for k in own if features.blocks[k].signal == "motor_current"), own[0])
+        phase, label = features.blocks[first].phase, labels[first]
+
+        def curves(signal: str, of: list[Array], own: list[int] = own, phase: Array = phase) -> Array | None:
+            k = next((k for k in own if features.blocks[k].signal == signal), None)
+            if k is None:
+                return None
+            return np.array([np.interp(phase, features.blocks[k].phase, row) for row in of[k]])
+
+        measured_all = [b.measured for b in features.blocks]
+        sets = []
+        for source in (measured_all, predicted):
+            parts = [curves(s, source) for s in ("encoder_position", "motor_current", "grip_force")]
+            n = next(p.shape[0] for p in parts if p is not None)
+            sets.append([metrics(phase, label, *(None if p is None else p[min(k, p.shape[0] - 1)] for p in parts))
+                         for k in range(n)])
+        for name, unit in METRICS.items():
+            m = np.array([row[name] for row in sets[0]])
+            s = np.array([row[name] for row in sets[1]])
+            if np.isfinite(m).any() and np.isfinite(s).any():
+                mean, model = float(np.nanmean(m)), float(np.nanmean(s))
+                sd = float(np.nanstd(m, ddof=1)) if np.isfinite(m).sum() > 1 else float("nan")
+                out.append(MetricRow(condition, name, unit, mean, sd, model,
+                                     (mean - model) / mean * 100.0 if mean else float("nan")))
+    return tuple(out)
