@@ -1,0 +1,167 @@
+"""motor_controller alone, driven over topics, and what happens to the motor when it dies or pauses."""
+
+from __future__ import annotations
+
+import math
+import signal
+
+import numpy as np
+from graph import NodeProcess, Peer, processes
+from hannes_control.double_pid import DoublePID
+from hannes_description.model import Model
+from hannes_ros import convert
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.serialization import serialize_message
+
+NAME = "motor_controller"
+
+
+def state_bytes(stamp_ns: int, position: float, names: tuple[str, ...] = ("motor_pulley",)) -> bytes:
+    sample = convert.JointSample(stamp_ns, (position,), (0.0,), (0.0,))
+    return serialize_message(convert.joint_message(names, sample))
+
+
+def say_tick(peer: Peer, tick: int, position: float, current: float, reference: float) -> None:
+    peer.say("reference_position", convert.float64_bytes(reference))
+    peer.say("motor_current", convert.float64_bytes(current))
+    peer.say("encoder_position", state_bytes(tick * 1_000_000, position))
+
+
+def announce(peer: Peer) -> None:
+    """Publishers of all that the controller hears, matched."""
+    for name in ("encoder_position", "motor_current", "reference_position"):
+        peer.matched(name)
+
+
+def voltages(peer: Peer) -> list[float]:
+    return [convert.float64_value(data) for data in peer.heard["motor_voltage"]]
+
+
+def call(peer: Peer, service: type, name: str, request: object) -> object:
+    client = peer.node.create_client(service, f"{NAME}/{name}")
+    peer.until(client.service_is_ready, what=name)
+    future = client.call_async(request)
+    peer.until(future.done, what=name)
+    return future.result()
+
+
+def transition(peer: Peer, number: int) -> bool:
+    return call(peer, ChangeState, "change_state", ChangeState.Request(transition=Transition(id=number))).success
+
+
+def test_lockstep_answers_each_state_with_the_law(peer):
+    peer.hear("motor_voltage")
+    law = DoublePID.of_model(Model.load("nominal").parameters)
+    rng = np.random.default_rng(0)
+    inputs = rng.uniform((0, 0, -1), (14, 14, 1), size=(30, 3)).tolist()
+    with processes(NodeProcess(NAME, clock="lockstep")):
+        announce(peer)
+        for tick, (reference, position, current) in enumerate(inputs):
+            say_tick(peer, tick, position, current, reference)
+            peer.until(lambda tick=tick: len(voltages(peer)) == tick + 1, what=f"voltage {tick}")
+        expected = [law.update(*values) for values in inputs]
+        assert voltages(peer) == expected
+        # a repeated reading is not answered again; a simulator that begins again finds a cleared controller
+        say_tick(peer, 29, *inputs[29][1:], inputs[29][0])
+        peer.spin(0.2)
+        assert len(voltages(peer)) == 30
+        for tick in range(2):
+            reference, position, current = inputs[tick]
+            peer.say("encoder_position", state_bytes(tick * 1_000_000, position))
+            peer.spin(0.05)
+            peer.say("motor_current", convert.float64_bytes(current))
+            peer.say("reference_position", convert.float64_bytes(reference))
+            peer.until(lambda tick=tick: len(voltages(peer)) == 31 + tick, what=f"voltage {tick} again")
+        assert voltages(peer)[30:] == expected[:2]
+
+
+def test_wrong_joint_and_not_finite_inputs_are_rejected_and_counted(peer):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    with processes(NodeProcess(NAME, clock="lockstep")) as (node,):
+        announce(peer)
+        peer.say("encoder_position", state_bytes(0, 1.0, names=("elbow",)))
+        for tick, current in enumerate((math.nan, math.inf, 0.5)):
+            say_tick(peer, tick, 1.0, current, 5.0)
+            peer.until(lambda tick=tick: len(voltages(peer)) == tick + 1, what=f"voltage {tick}")
+        status = peer.until_status(NAME, lambda s: s["cycles"] == "3", "the counts")
+        assert (status["rejected_states"], status["rejected_inputs"]) == ("1", "2")
+        assert voltages(peer)[:2] == [0.0, 0.0]
+        assert voltages(peer)[2] > 0.0
+        assert "motor/state is rejected: the joints are ['elbow'], expected ['motor_pulley']" in node.output
+
+
+def test_the_motor_is_driven_only_while_active_and_activation_clears_the_integrator(peer):
+    peer.hear("motor_voltage")
+    with processes(NodeProcess(NAME, clock="lockstep", autostart=False)):
+        announce(peer)
+        say_tick(peer, 0, 0.0, 0.0, 5.0)
+        peer.spin(0.3)
+        assert voltages(peer) == []
+        assert call(peer, GetState, "get_state", GetState.Request()).current_state.label == "unconfigured"
+        assert transition(peer, Transition.TRANSITION_CONFIGURE)
+        assert transition(peer, Transition.TRANSITION_ACTIVATE)
+        peer.until(lambda: len(voltages(peer)) == 1, what="the answer to the waiting tick")
+        for tick in range(1, 5):
+            say_tick(peer, tick, 0.0, 0.0, 5.0)
+            peer.until(lambda tick=tick: len(voltages(peer)) == tick + 1)
+        assert voltages(peer)[4] > voltages(peer)[0]  # the integrator has grown
+        assert transition(peer, Transition.TRANSITION_DEACTIVATE)
+        say_tick(peer, 5, 0.0, 0.0, 5.0)
+        peer.spin(0.3)
+        assert len(voltages(peer)) == 5
+        assert transition(peer, Transition.TRANSITION_ACTIVATE)
+        peer.until(lambda: len(voltages(peer)) == 6)
+        assert voltages(peer)[5] == voltages(peer)[0]
+
+
+def test_real_time_goes_to_zero_volt_when_the_state_stops(peer):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    # A long limit for pauses: this test is about the state, on a machine that may be loaded.
+    with processes(NodeProcess(NAME, clock="realtime", pause_limit_ms=10000)):
+        announce(peer)
+        peer.say("reference_position", convert.float64_bytes(5.0))
+        for _ in range(30):
+            now = peer.node.get_clock().now().nanoseconds
+            peer.say("encoder_position", state_bytes(now, 1.0))
+            peer.say("motor_current", convert.float64_bytes(0.1))
+            peer.spin(0.01)
+        assert max(voltages(peer)) > 1.0
+        status = peer.until_status(NAME, lambda s: int(s["state_timeouts"]) >= 1, "the timeout")
+        peer.until(lambda: voltages(peer)[-1] == 0.0, what="0 V")
+        before = int(status["rejected_states"])
+        peer.say("encoder_position", state_bytes(1_000_000_000, 1.0))  # a stamp of long ago
+        peer.until_status(NAME, lambda s: int(s["rejected_states"]) == before + 1, "the old stamp counted")
+        assert voltages(peer)[-1] == 0.0
+
+
+def test_killed_or_stopped_controller_leaves_zero_volt(peer):
+    peer.hear_diagnostics()
+    sim = NodeProcess("hand_sim", clock="realtime", command_timeout_ms=60)
+    # The period is long because two real-time loops and the test share this machine with others.
+    first = NodeProcess(NAME, clock="realtime", reference="half_sine", period=0.005, pause_limit_ms=400,
+                        state_timeout_ms=1000)
+    with processes(sim, first):
+        running = peer.until_status("hand_sim", lambda s: s["message"] == "running", "a driven motor")
+        before = int(running["command_timeouts"])
+        first.send(signal.SIGSTOP)
+        stopped = peer.until_status("hand_sim", lambda s: s["message"] == "command timed out: 0 V", "the timeout")
+        assert stopped["applied_voltage"] == "0"
+        assert int(stopped["command_timeouts"]) > before
+        assert float(stopped["command_age_at_zero_s"]) <= 0.1
+        peer.spin(0.5)
+        first.send(signal.SIGCONT)
+        peer.until_status(NAME, lambda s: s["trips"] == "1", "the pause noticed")
+        paused = peer.status(NAME)
+        assert paused["active"] == "False"
+        assert "activate again" in paused["message"]
+        peer.spin(0.3)
+        assert peer.status("hand_sim")["message"] == "command timed out: 0 V"
+        assert transition(peer, Transition.TRANSITION_ACTIVATE)
+        peer.until_status("hand_sim", lambda s: s["message"] == "running", "driven again")
+        first.send(signal.SIGKILL)
+        killed = peer.until_status("hand_sim", lambda s: s["message"] == "command timed out: 0 V", "the timeout")
+        assert killed["applied_voltage"] == "0"
+        assert float(killed["command_age_at_zero_s"]) <= 0.1
