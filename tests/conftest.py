@@ -12,11 +12,13 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
+DISCOVERY_PROFILE = REPOSITORY / "ros2_ws/src/hannes_bringup/hannes_bringup/config/fastdds.xml"
+
 # Read by ROS 2 when the first node of the process starts, so set before any test: this host only; UDP, since
 # the shared memory of a killed process holds up the next discovery for seconds; early announcements.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
-os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(REPOSITORY / "tests" / "fastdds.xml"))
+os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(DISCOVERY_PROFILE))
 os.environ.setdefault("RCUTILS_COLORIZED_OUTPUT", "0")
 if not os.environ.get("AMENT_PREFIX_PATH"):
     # the wheels put ROS 2 into the environment itself, which so is a prefix of the ament index

@@ -17,6 +17,8 @@ def ros_environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
 
     AMENT_PREFIX_PATH              this Python environment, where ROS 2 came as wheels and nothing is sourced
     ROS_AUTOMATIC_DISCOVERY_RANGE  LOCALHOST: nodes on other machines neither see nor drive the hand
+    FASTDDS_BUILTIN_TRANSPORTS     UDPv4: after a kill -9 the shared memory left behind stalls discovery for seconds
+    FASTRTPS_DEFAULT_PROFILES_FILE config/fastdds.xml: nodes find each other at once on a busy machine, too
     ROS_LOG_DIR                    a temporary folder, where the home folder cannot be written
 
     What the user has set is kept.
@@ -25,6 +27,10 @@ def ros_environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
     if not environment.get("AMENT_PREFIX_PATH") and (Path(sys.prefix) / "share" / "ament_index").is_dir():
         environment["AMENT_PREFIX_PATH"] = sys.prefix
     environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    environment.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
+    environment.setdefault(
+        "FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).parent / "config" / "fastdds.xml")
+    )
     if "ROS_LOG_DIR" not in environment and "ROS_HOME" not in environment:
         home = Path(environment.get("HOME") or "/nonexistent")
         if not os.access(home / ".ros" if (home / ".ros").exists() else home, os.W_OK):

@@ -12,13 +12,14 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
-from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.executors import Executor
+from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
-DISCOVERY = 1.0
-"""s to wait for the graph before measuring; on one machine nodes are known after 0.1 s."""
+QUIET, LONGEST = 0.5, 3.0
+"""s: discovery is over when no topic or node was added for QUIET, or after LONGEST."""
 HIDDEN = ("/parameter_events", "/rosout")
 LEVELS = {b"\x00": "ok", b"\x01": "warn", b"\x02": "error", b"\x03": "stale"}
 
@@ -69,7 +70,8 @@ class _Arrivals:
 
     def __call__(self, message: bytes) -> None:
         self.last = time.monotonic()
-        self.first = self.first or self.last
+        if self.count == 0:
+            self.first = self.last
         self.count += 1
         if self.kept is not None:
             self.kept.append(message)
@@ -88,7 +90,7 @@ def watch(window: float, context: Context | None = None) -> GraphSeen:
         enable_rosout=False,
         start_parameter_services=False,
     )
-    executor = SingleThreadedExecutor(context=context)
+    executor = EventsExecutor(context=context)
     executor.add_node(node)
     try:
         return _watch(node, executor, window)
@@ -100,17 +102,14 @@ def watch(window: float, context: Context | None = None) -> GraphSeen:
 
 
 def _watch(node: Node, executor: Executor, window: float) -> GraphSeen:
-    _spin(executor, DISCOVERY)
     subscribed: dict[str, _Arrivals] = {}
-    types = {name: kinds[0] for name, kinds in node.get_topic_names_and_types() if name not in HIDDEN}
-    for name, kind in types.items():
-        message = message_class(kind)
-        if message is not None and node.count_publishers(name):
-            subscribed[name] = _Arrivals(keep_last=name == "/diagnostics")
-            node.create_subscription(message, name, subscribed[name], _listener_qos(), raw=True)
+    _discover(node, executor, subscribed)
+    for heard in subscribed.values():
+        heard.count = 0
     started = time.monotonic()
     _spin(executor, window)
     now = time.monotonic()
+    types = _topics(node)
     topics = []
     for name, kind in sorted(types.items()):
         arrivals = subscribed.get(name)
@@ -135,6 +134,26 @@ def _watch(node: Node, executor: Executor, window: float) -> GraphSeen:
         nodes=tuple(_nodes(node, health)),
         topics=tuple(topics),
     )
+
+
+def _discover(node: Node, executor: Executor, subscribed: dict[str, _Arrivals]) -> None:
+    """Subscribe to every topic with a publisher, until no more of them appear."""
+    started = changed = time.monotonic()
+    known: tuple[set[str], int] = (set(), 0)
+    while (now := time.monotonic()) - changed < QUIET and now - started < LONGEST:
+        for name, kind in _topics(node).items():
+            message = message_class(kind)
+            if name not in subscribed and message is not None and node.count_publishers(name):
+                subscribed[name] = _Arrivals(keep_last=name == "/diagnostics")
+                node.create_subscription(message, name, subscribed[name], _listener_qos(), raw=True)
+        seen = (set(subscribed), len(node.get_node_names()))
+        if seen != known:
+            known, changed = seen, now
+        _spin(executor, 0.05)
+
+
+def _topics(node: Node) -> dict[str, str]:
+    return {name: kinds[0] for name, kinds in node.get_topic_names_and_types() if name not in HIDDEN}
 
 
 def _nodes(node: Node, health: dict[str, str]) -> list[NodeSeen]:
