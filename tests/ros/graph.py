@@ -143,7 +143,8 @@ class Peer:
                         **{pair.key: pair.value for pair in status.values}}
         return {}
 
-    def until_status(self, node: str, condition: Callable[[Mapping[str, str]], bool], what: str = "") -> Mapping[str, str]:
+    def until_status(self, node: str, condition: Callable[[Mapping[str, str]], bool],
+                     what: str = "") -> Mapping[str, str]:
         self.until(lambda: bool(self.status(node)) and condition(self.status(node)), what=what)
         return self.status(node)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ def test_source_plays_a_file_in_real_time(peer, tmp_path: Path):
         peer.until(lambda: len(peer.heard["emg_extensor"]) > 100, what="samples")
     flexor = values(peer, "emg_flexor")
     played = flexor[: flexor.index(0.0, 1)] if flexor[0] != 0.0 else flexor
-    assert all(b - a == 1.0 for a, b in zip(played, played[1:], strict=False) if b != 0.0)
+    assert all(b - a == 1.0 for a, b in pairwise(played) if b != 0.0)
     assert flexor[-1] == 0.0
 
 

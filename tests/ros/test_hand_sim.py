@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -81,7 +82,7 @@ def test_real_time_gives_zero_volt_when_commands_stop(peer):
         say_voltage(peer, 5.0)
         peer.until_status("hand_sim", lambda s: s["command_timeouts"] == "2", "a second timeout")
     states = [convert.MOTOR_STATE.decode(data) for data in peer.heard["encoder_position"]]
-    assert all(b.stamp_ns > a.stamp_ns for a, b in zip(states, states[1:], strict=False))
+    assert all(b.stamp_ns > a.stamp_ns for a, b in pairwise(states))
     assert len(peer.heard["motor_current"]) > driven
 
 

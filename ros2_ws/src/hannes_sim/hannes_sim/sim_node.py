@@ -159,7 +159,7 @@ class HandSim(HannesNode, Node):
         return True
 
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
-        gate, now = self._gate, monotonic()
+        gate = self._gate
         self._health.last_input = gate.last_command
         age = "" if gate.age_at_zero is None else f"{gate.age_at_zero:.4f}"
         values: dict[str, object] = {
@@ -174,7 +174,8 @@ class HandSim(HannesNode, Node):
         if self._reported:
             return WARN, f"waiting for {', '.join(self._reported)}", values
         if self._watch.stalled:
-            return ERROR, f"waiting {self._watch.waiting(now):.1f} s for motor/voltage of tick {self._tick}", values
+            waited = self._watch.waiting(monotonic())
+            return ERROR, f"waiting {waited:.1f} s for motor/voltage of tick {self._tick}", values
         return OK, "running", values
 
     # -- real time ---------------------------------------------------------------------------------------------------
@@ -228,10 +229,11 @@ class HandSim(HannesNode, Node):
         """Start when the peers are there; report a stall; repeat the reading to newcomers."""
         if not self._peers.complete:
             missing = self._peers.missing()
-            if missing != self._reported:
-                self._reported = missing
-                self.get_logger().info(f"waiting for {', '.join(missing)}" if missing else "all peers are there")
+            if missing and missing != self._reported:
+                self.get_logger().info(f"waiting for {', '.join(missing)}")
+            self._reported = missing
             if not missing:
+                self.get_logger().info("all peers are there: starting")
                 self._began = monotonic()
                 self._publish_tick()
             return
