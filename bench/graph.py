@@ -2,7 +2,8 @@
 
 Times the loop alone (hand_sim and motor_controller) and the whole chain from EMG, as separate processes and composed in
 one, beside the same closed loop in process. Prints ratios to real time, and where the time of a tick goes: the plant
-and the law (from the rollout), other computing (from the CPU time of the processes), and waiting for messages and threads.
+and the law (from the rollout), other computing (from the CPU time of the processes), and waiting for messages
+and threads.
 """
 
 from __future__ import annotations

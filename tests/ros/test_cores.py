@@ -9,7 +9,7 @@ from time import sleep
 import pytest
 from hannes_description.errors import HannesError
 from hannes_ros.command import CommandGate
-from hannes_ros.diagnostics import Rate
+from hannes_ros.diagnostics import ERROR, OK, WARN, Rate, missed_level
 from hannes_ros.lockstep import Peers, StallWatch, TickJoin, samples_until
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.run import _node_rules
@@ -128,6 +128,11 @@ def test_rate_is_between_two_looks():
     rate = Rate(now=10.0)
     assert rate.update(12.0, 100) == pytest.approx(50.0)
     assert rate.update(13.0, 100) == 0.0
+
+
+def test_missed_cycles_warn_and_then_are_an_error():
+    assert [missed_level(1000 - n, n) for n in (0, 10, 11, 100, 101)] == [OK, OK, WARN, WARN, ERROR]
+    assert missed_level(0, 0) == OK
 
 
 # -- arguments -------------------------------------------------------------------------------------------------------

@@ -65,7 +65,7 @@ def test_early_signals_end_quietly(ros_environment, delay):
     ("hand_sim", (), {"model": "nobody"}, "No model 'nobody'"),
     ("hand_sim", (), {"object_size": 0.05}, "need an object"),
     ("hand_sim", (), {"period": 0.00033}, "not a multiple of the plant's step"),
-    ("motor_controller", (), {"reference": "sinus"}, "of node 'motor_controller' is 'sinus'; valid are topic, half_sine"),
+    ("motor_controller", (), {"reference": "sinus"}, "'motor_controller' is 'sinus'; valid are topic, half_sine"),
     ("motor_controller", (), {"period": "fast"}, "it must be a number"),
     ("emg_reference", (), {"envelope_cutoff": -1.0}, "it must be between 0.1 and 45.0 Hz"),
     ("emg_reference", ("--verbose",), {}, "Unknown argument '--verbose'"),

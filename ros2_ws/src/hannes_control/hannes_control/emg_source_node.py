@@ -117,8 +117,8 @@ class EmgSource(HannesNode, Node):
             self.fail(f"The EMG stopped: {self._loop.error!r}")
 
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
-        values: dict[str, object] = {"samples": len(self._samples), "sent": self._sent,
-                                     "missed_cycles": self._loop.missed}
+        self._health.missed = self._loop.missed
+        values: dict[str, object] = {"samples": len(self._samples), "sent": self._sent}
         if self._lockstep and (missing := self._peers.missing()):
             return WARN, f"waiting for {', '.join(missing)}", values
         return OK, "running" if self._sent < len(self._samples) else "played to the end: rest", values

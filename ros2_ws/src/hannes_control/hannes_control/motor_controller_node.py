@@ -256,8 +256,8 @@ class MotorController(HannesNode, LifecycleNode):
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         self._health.last_input = self._state_at or None
         age = f"{monotonic() - self._reference_at:.3f}" if self._reference_at else ""
-        values: dict[str, object] = {"missed_cycles": self._missed + (self._loop.missed if self._loop else 0),
-                                     "active": self._active, "battery_saver": self._pid.saving, "reference_age_s": age}
+        self._health.missed = self._missed + (self._loop.missed if self._loop else 0)
+        values: dict[str, object] = {"active": self._active, "battery_saver": self._pid.saving, "reference_age_s": age}
         if not self._active:
             return WARN, "not active: motor off" + ("; activate again" if self._tripped else ""), values
         if self._lockstep and not self._peers.complete:

@@ -17,12 +17,16 @@ from .topics import diagnostics_publisher
 
 OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE)
 
+MISSED_WARN, MISSED_ERROR = 0.01, 0.1
+"""Share of missed cycles from which a node warns, and from which it reports an error."""
+
 
 class Health:
-    """Counters of a node: cycles done, last input, and named events (timeouts, missed cycles, rejected messages)."""
+    """Counters of a node: cycles done and missed, last input, and named events (timeouts, rejected messages)."""
 
     def __init__(self, *events: str) -> None:
         self.cycles = 0
+        self.missed = 0
         self.last_input: float | None = None
         self.counts: dict[str, int] = dict.fromkeys(events, 0)
 
@@ -45,10 +49,17 @@ class Rate:
         return rate
 
 
+def missed_level(done: int, missed: int) -> bytes:
+    """Level of a loop that did and missed so many cycles lately."""
+    share = missed / max(1, done + missed)
+    return ERROR if share > MISSED_ERROR else WARN if share > MISSED_WARN else OK
+
+
 class Diagnostics:
     """Publishes the health of one node.
 
-    state   called for each report: (level, message, further values)
+    state   called for each report: (level, message, further values); may set `health.missed`
+    A loop that missed more cycles than MISSED_WARN or MISSED_ERROR since the last report raises the level.
     """
 
     def __init__(self, node: Node, health: Health,
@@ -56,15 +67,21 @@ class Diagnostics:
         self._node, self._health, self._state = node, health, state
         self._publisher = diagnostics_publisher(node)
         self._rate = Rate(monotonic())
+        self._before = (0, 0)
         self._timer = node.create_timer(period, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def publish(self) -> None:
         """Report now."""
         now, health = monotonic(), self._health
         level, message, values = self._state()
+        (done, missed), self._before = self._before, (health.cycles, health.missed)
+        done, missed = health.cycles - done, health.missed - missed
+        if missed_level(done, missed) > level:
+            level, message = missed_level(done, missed), f"{message}; missed {missed} of {done + missed} cycles"
         age = "" if health.last_input is None else f"{now - health.last_input:.3f}"
         pairs: dict[str, object] = {"rate_hz": f"{self._rate.update(now, health.cycles):.1f}",
-                                    "cycles": health.cycles, "input_age_s": age, **health.counts, **values}
+                                    "cycles": health.cycles, "missed_cycles": health.missed,
+                                    "input_age_s": age, **health.counts, **values}
         status = DiagnosticStatus(level=level, name=self._node.get_fully_qualified_name(), message=message,
                                   hardware_id="hannes",
                                   values=[KeyValue(key=key, value=str(value)) for key, value in pairs.items()])

@@ -159,11 +159,11 @@ class HandSim(HannesNode, Node):
         return True
 
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
-        gate = self._gate
+        gate, self._health.missed = self._gate, self._loop.missed
         self._health.last_input = gate.last_command
         age = "" if gate.age_at_zero is None else f"{gate.age_at_zero:.4f}"
         values: dict[str, object] = {
-            "tick": self._tick, "missed_cycles": self._loop.missed, "stalls": self._watch.stalls,
+            "tick": self._tick, "stalls": self._watch.stalls,
             "rejected_commands": gate.rejected, "clamped_commands": gate.clamped, "command_timeouts": gate.timeouts,
             "command_age_at_zero_s": age}
         if not self._lockstep:
