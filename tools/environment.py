@@ -37,8 +37,7 @@ CONSTRAINTS = ROOT / "requirements" / "constraints.txt"
 SUPPORTED = ("3.11", "3.12")
 APT_PYTHON = "/usr/bin/python3"
 STAMP = "hannes-environment.json"
-# rclpy and the messages of Ubuntu 24.04's apt ROS are compiled against this NumPy
-NUMPY_OF_APT_ROS = "1.26.4"
+CONSTRAINTS_APT_ROS = ROOT / "requirements" / "constraints-apt-ros.txt"
 
 
 class SetupError(Exception):
@@ -264,8 +263,11 @@ def requirements_lines(apt_ros: bool) -> list[str]:
 
 
 def constraints_text(apt_ros: bool) -> str:
-    text = CONSTRAINTS.read_text()
-    return re.sub(r"(?m)^numpy==.*$", f"numpy=={NUMPY_OF_APT_ROS}", text) if apt_ros else text
+    """The pins, with those of constraints-apt-ros.txt in place of their namesakes beside an apt ROS."""
+    pins = dict(line.split("==") for line in lines(CONSTRAINTS.read_text()))
+    if apt_ros:
+        pins |= dict(line.split("==") for line in lines(CONSTRAINTS_APT_ROS.read_text()))
+    return "".join(f"{name}=={version}\n" for name, version in pins.items())
 
 
 def fingerprint(apt_ros: bool) -> str:
