@@ -1,8 +1,8 @@
 """The tree of links and joints, from the parameters; MJCF and URDF are both written from it.
 
-Palm frame (REP-103 units, base_link): x palmar, y radial, z distal, origin at the wrist.  Every moving link's frame sits
-in its joint with z along the straight finger and y the flexion axis, so that a positive angle flexes.  ABD turns about
--x: positive is radial.  The thumb's rotation is a weld at one of the stops.
+Palm frame (REP-103 units, base_link): x palmar, y radial, z distal, origin at the wrist.  Every moving link's frame
+sits in its joint with z along the straight finger and y the flexion axis, so that a positive angle flexes.  ABD turns
+about -x: positive is radial.  The thumb's rotation is a weld at one of the stops.
 """
 
 from __future__ import annotations
@@ -102,7 +102,8 @@ def links(parameters: Parameters, thumb_stop_deg: float = 0) -> tuple[Link, ...]
         base = v("inertia.base_inertia")
         abd, mcp, pip = (f"{finger}_{joint}" for joint in ("abd", "mcp", "pip"))
         out.append(Link(f"{finger}_base", ROOT, place, (0.0, 0.0, 0.0),
-                        Joint(abd, (-1.0, 0.0, 0.0), JOINT_LIMITS[abd]), v("inertia.base_mass"), 0.0, (base, base, base)))
+                        Joint(abd, (-1.0, 0.0, 0.0), JOINT_LIMITS[abd]), v("inertia.base_mass"), 0.0,
+                        (base, base, base)))
         out.append(Link(f"{finger}_phalanx", f"{finger}_base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0),
                         Joint(mcp, flex, JOINT_LIMITS[mcp]), v(f"inertia.{finger}_m1"), v(f"inertia.{finger}_lm1"),
                         _moments(v(f"inertia.{finger}_j1")), proximal, radius))

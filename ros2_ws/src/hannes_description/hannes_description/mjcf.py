@@ -1,18 +1,21 @@
 """The hand as a MuJoCo model, built from the parameters.
 
-Coordinates (variant transmission="wires"): a slide `motor` [m] is the wire that the pulley has taken up, its mass the rotor's
-inertia / radius^2.  Two carts on guides, c1 (index and middle) and c2 (ring and little), are movable pulleys of
-the master wire:
+Coordinates (variant transmission="wires"): a slide `motor` [m] is the wire that the pulley has taken up, its
+mass the rotor's inertia / radius^2.  Two carts on guides, c1 (index and middle) and c2 (ring and little), are
+movable pulleys of the master wire:
 
     master   x_motor - 2 c1 - 2 c2 - w_thumb               <= 0
     slave    c_j - (rb w_a + ra w_b) / (ra + rb)           <= 0        (thesis P14)
     w        = sum of flexor arm x joint angle, per digit
 
-so a master tension F gives each cart 2F, finger a rb/(ra+rb) 2F, finger b ra/(ra+rb) 2F and the thumb F.  Wires are fixed
-tendons with an upper limit: they pull, stretch by F/K, and go slack.
+so a master tension F gives each cart 2F, finger a rb/(ra+rb) 2F, finger b ra/(ra+rb) 2F and the thumb F.
+Wires are fixed tendons with an upper limit: they pull, stretch by F/K, and go slack.
 
-transmission="forces": no carts and no limits.  One fixed tendon `drive` (the sum of all wires at equal tension) carries the
-rotor's inertia as tendon armature, and its length is the wire taken up; the same shares of force, without wires.
+transmission="forces": no carts, no limits and nothing that can go slack.  One fixed tendon `drive`, x_motor less
+the sum of all wires at equal tension, is held at zero by an equality of the master wire's stiffness, so that the
+motor's force goes to the joints in the same shares, pushing as well as pulling.  (A tendon armature on the joints
+alone would not do: MuJoCo keeps its couplings only within a kinematic tree, and every finger is a tree; the rotor
+would feel five times too light.)
 
 return_mechanism="return_wire": a dorsal wire over MCP and PIP, T = preload + rate x (arms x angles);
 "torsion_spring": one spring per joint, M = M0 + k q, with the same moment at the open hand and at full flexion.
@@ -42,9 +45,10 @@ MASTER, SLAVES, DRIVE = "master", ("slave_index_middle", "slave_ring_little"), "
 CARTS = ("cart_index_middle", "cart_ring_little")
 PAIRS: tuple[tuple[str, str], tuple[str, str]] = (("index", "middle"), ("ring", "little"))
 
-# Impedance of the constraints.  A row adds the virtual mass d / ((1 - d) A) to its own stretch (not to the common motion of
-# what it connects); it keeps the light carts stable at the default step and leaves stiffness and damping exact.
-WIRE_IMPEDANCE, STOP_IMPEDANCE, CONTACT_IMPEDANCE = 0.9, 0.9, 0.5
+# Impedance of the constraints.  A row adds the virtual mass d / ((1 - d) A) to its own stretch (not to the common
+# motion of what it connects); it keeps light carts and fingers stable up to a step of 0.4 ms, and leaves stiffness and
+# damping exact.
+WIRE_IMPEDANCE, STOP_IMPEDANCE, CONTACT_IMPEDANCE = 0.9, 0.97, 0.5
 
 FRICTION_SOLREF, FRICTION_SOLIMP = (0.0005, 1.0), (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Dry friction: the creep speed under a load f is f A (1 - d) / b; the defaults creep by degrees a second."""
@@ -211,6 +215,7 @@ def build_spec(parameters: Parameters, variant: Variant | Mapping[str, Any] | No
     for link in tree:
         bodies[link.name] = _add_link(bodies[link.parent], link, parameters)
     _add_return(spec, parameters, chosen)
+    _add_motor(palm, parameters)
     if chosen.transmission == "wires":
         _add_wires(spec, palm, parameters)
     else:
@@ -325,17 +330,20 @@ def _slide(palm: Any, name: str, place: tuple[float, float, float], mass: float)
     return joint
 
 
+def _add_motor(palm: Any, parameters: Parameters) -> None:
+    # The rotor is a mass, not an armature: the compiler leaves the armature out of the constraint weights, and the
+    # motor's dry friction would creep at centimetres a second.
+    radius = value(parameters, "pulley.radius")
+    motor = _slide(palm, MOTOR, (0.0, 0.0, 0.0), reflected_mass(parameters))
+    motor.limited = False
+    motor.frictionloss = value(parameters, "friction.coulomb") / radius
+    _scalar(motor, "damping", value(parameters, "friction.viscous") / radius**2)
+
+
 def _add_wires(spec: mujoco.MjSpec, palm: Any, parameters: Parameters) -> None:
     def v(name: str) -> float:
         return value(parameters, name)
 
-    radius = v("pulley.radius")
-    # The rotor is a mass, not an armature: the compiler leaves the armature out of the constraint weights, and the
-    # motor's dry friction would creep at centimetres a second.
-    motor = _slide(palm, MOTOR, (0.0, 0.0, 0.0), reflected_mass(parameters))
-    motor.limited = False
-    motor.frictionloss = v("friction.coulomb") / radius
-    _scalar(motor, "damping", v("friction.viscous") / radius**2)
     for name, side in zip(CARTS, (0.01, -0.01), strict=True):
         cart = _slide(palm, name, (0.0, side, 0.05), v("carts.mass"))
         cart.limited, cart.range = True, [0.0, v("carts.travel")]
@@ -364,13 +372,12 @@ def _wire(spec: mujoco.MjSpec, name: str) -> Any:
 
 
 def _add_drive(spec: mujoco.MjSpec, parameters: Parameters) -> None:
-    radius = value(parameters, "pulley.radius")
-    drive = spec.add_tendon(name=DRIVE, limited=False, armature=reflected_mass(parameters),
-                            frictionloss=value(parameters, "friction.coulomb") / radius)
-    drive.solref_friction, drive.solimp_friction = list(FRICTION_SOLREF), list(FRICTION_SOLIMP)
-    _scalar(drive, "damping", value(parameters, "friction.viscous") / radius**2)
+    drive = spec.add_tendon(name=DRIVE, limited=False)
+    drive.wrap_joint(MOTOR, 1.0)
     for joint, arm in transmission_jacobian(parameters).items():
-        drive.wrap_joint(joint, arm)
+        drive.wrap_joint(joint, -arm)
+    spec.add_equality(name=DRIVE, type=mujoco.mjtEq.mjEQ_TENDON, objtype=mujoco.mjtObj.mjOBJ_TENDON, name1=DRIVE,
+                      solimp=_flat(WIRE_IMPEDANCE))
 
 
 def _add_object(spec: mujoco.MjSpec, grasp: GraspShape, tree: tuple[Link, ...]) -> None:
@@ -412,14 +419,20 @@ def _map_stiffness(spec: mujoco.MjSpec, parameters: Parameters, variant: Variant
     for joint in spec.joints:
         weight = float(model.dof_invweight0[model.joint(joint.name).dofadr[0]])
         if joint.limited:
-            group = "carts" if joint.name in CARTS else "joints"
-            joint.solref_limit = list(direct_solref(v(f"{group}.stop_stiffness"), v(f"{group}.stop_damping"),
+            stiffness = v("carts.stop_stiffness" if joint.name in CARTS else "joints.stop_stiffness")
+            # Critical damping of the joint's inertia 1/A and the row's virtual inertia together.
+            critical = 2.0 * math.sqrt(stiffness / ((1.0 - STOP_IMPEDANCE) * weight))
+            joint.solref_limit = list(direct_solref(stiffness, v("joints.stop_damping_ratio") * critical,
                                                     STOP_IMPEDANCE, weight))
     if variant.transmission == "wires":
         for name in (MASTER, *SLAVES):
             stiffness = v("wires.master_stiffness" if name == MASTER else "wires.slave_stiffness")
             weight = float(model.tendon_invweight0[model.tendon(name).id])
             spec.tendon(name).solref_limit = list(direct_solref(stiffness, v("wires.damping"), WIRE_IMPEDANCE, weight))
+    else:
+        weight = float(model.tendon_invweight0[model.tendon(DRIVE).id])
+        spec.equality(DRIVE).solref = list(direct_solref(v("wires.master_stiffness"), v("wires.damping"),
+                                                         WIRE_IMPEDANCE, weight))
     if grasp is not None:
         stiffness, damping = contact_stiffness(grasp)
         for pair in spec.pairs:

@@ -1,8 +1,8 @@
 """The hand as URDF, written from the same tree as the MuJoCo model (hannes_description.kinematics).
 
-What URDF cannot say (wires, carts, return springs, the motor) is left out: the file is for tf, RViz and planners.  Frames,
-limits, masses and inertias are those of the MuJoCo model; `data/urdf/hannes.urdf` is this generator's output for the shipped
-parameters and the thumb's stop 0.
+What URDF cannot say (wires, carts, return springs, the motor) is left out: the file is for tf, RViz and planners.
+Frames, limits, masses and inertias are those of the MuJoCo model; `data/urdf/hannes.urdf` is this generator's output
+for the shipped parameters and the thumb's stop 0.
 
     python -m hannes_description.urdf        prints the file
 """

@@ -1,18 +1,19 @@
 """The full hand: MuJoCo's multi-body dynamics behind the same drive, effects and sensors as the reduced plant.
 
-Each step (compiled, no Python): command and effects -> motor current and torque -> outputs of the effects onto MuJoCo's
-arrays -> mj_step.  How the outputs are mapped (r = pulley radius; J = pulley rad per joint rad while all wires are taut):
+Each step (compiled, no Python): command and effects -> motor current and torque -> outputs of the effects onto
+MuJoCo's arrays -> mj_step.  How the outputs are mapped (r = pulley radius; J = pulley rad per joint rad while all
+wires are taut):
 
     TORQUE, FRICTION, DAMPING, INERTIA   the slide of the motor: / r, / r, / r^2, / r^2
     LOAD_TORQUE, LOAD_FRICTION           the flexed joints: x J (the same power at the pulley)
-    LOAD_DAMPING                         the flexed joints: x J w, w = pulley range / joint range (the same torque while
-                                         all joints close together), kept implicit and diagonal
-    SLACK, COMPLIANCE                    limit and stiffness of the master wire; without wires they have no meaning
+    LOAD_DAMPING                         the flexed joints: x J w, w = pulley range / joint range (the same torque
+                                         while all joints close together), kept implicit and diagonal
+    SLACK, COMPLIANCE                    limit and stiffness of the master wire (no slack in the forces variant)
     OBJECT_DAMPING                       the contacts, by hand.fingertip_travel
 
 Inputs: QL, VL are the finger joints through J; LOAD is the master wire's tension x r; CONTACT is the grip force x
-hand.fingertip_travel.  Dry friction and damping are MuJoCo's own (solved implicitly); an explicit friction torque would be
-unstable above 0.05 ms.
+hand.fingertip_travel.  Dry friction and damping are MuJoCo's own (solved implicitly); an explicit friction torque
+would be unstable above 0.05 ms.
 """
 
 from __future__ import annotations
@@ -100,17 +101,14 @@ from .ports import (
 )  # fmt: skip
 
 # Parameters of this plant, after the common ones
-_RADIUS, _COULOMB, _VISCOUS, _TIP, _WIRE_K, _WIRE_GAIN, _OBJECT_B = range(N_PARAMETERS_COMMON, N_PARAMETERS_COMMON + 7)
-_N_PARAMETERS = N_PARAMETERS_COMMON + 7
-# States of this plant: the previous motor speed (the transmitted torque without wires)
-_SV = N_STATE_COMMON
-_N_STATES = N_STATE_COMMON + 1
+_RADIUS, _COULOMB, _VISCOUS, _TIP, _WIRE_K, _WIRE_B, _WIRE_GAIN, _OBJECT_B \
+    = range(N_PARAMETERS_COMMON, N_PARAMETERS_COMMON + 8)
+_N_PARAMETERS = N_PARAMETERS_COMMON + 8
 
 # Entries of the handle after the common ones: addresses of MuJoCo's structs and arrays
 _MODEL, _DATA, _STEP, _COUNTS, _QPOS, _QVEL, _APPLIED, _FRICTION, _DAMPING, _ARMATURE, _WIRE_RANGE, _WIRE_SOLREF, \
-    _PAIR_SOLREF, _SENSORS, _WARNINGS, _TABLE, _DRIVE_FRICTION, _DRIVE_DAMPING, _DRIVE_ARMATURE \
-    = range(N_HANDLE_COMMON, N_HANDLE_COMMON + 19)
-_N_HANDLE = N_HANDLE_COMMON + 19
+    _PAIR_SOLREF, _SENSORS, _WARNINGS, _TABLE, _MASS = range(N_HANDLE_COMMON, N_HANDLE_COMMON + 17)
+_N_HANDLE = N_HANDLE_COMMON + 17
 
 # Counts: int64
 _C_NQ, _C_WIRES, _C_MOTOR, _C_TENSION, _C_GRIP, _C_PAIRS, _C_JOINTS = 0, 1, 2, 3, 4, 5, 6
@@ -119,7 +117,7 @@ _N_COUNTS = _C_JOINTS + N_JOINTS
 # Table: float64 rows of N_JOINTS: J, w J, base dry friction, base damping; then the contact weights
 _T_J, _T_W, _T_FRICTION, _T_DAMPING, _T_PAIRS = 0, N_JOINTS, 2 * N_JOINTS, 3 * N_JOINTS, 4 * N_JOINTS
 
-_FASTEST = 1e5
+_FASTEST = 1e4
 """rad/s or m/s; beyond it the simulation has diverged."""
 
 _FATAL = tuple(int(w) for w in (mujoco.mjtWarning.mjWARN_INERTIA, mujoco.mjtWarning.mjWARN_CONTACTFULL,
@@ -137,19 +135,20 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
     count, table = pointer_i8(handle[_COUNTS]), pointer_f8(handle[_TABLE])
     qpos, qvel, applied = pointer_f8(handle[_QPOS]), pointer_f8(handle[_QVEL]), pointer_f8(handle[_APPLIED])
     friction, damping = pointer_f8(handle[_FRICTION]), pointer_f8(handle[_DAMPING])
-    armature, sensors = pointer_f8(handle[_ARMATURE]), pointer_f8(handle[_SENSORS])
+    armature, mass, sensors = pointer_f8(handle[_ARMATURE]), pointer_f8(handle[_MASS]), pointer_f8(handle[_SENSORS])
     r, dt, motor = p[_RADIUS], p[P_DT], count[_C_MOTOR]
     wires = count[_C_WIRES] != 0
-    q = ql = v = vl = 0.0
+    q = ql = v = vl = bad = 0.0
     for k in range(steps + 1):
         ql = vl = 0.0
         for j in range(N_JOINTS):
             ql += table[_T_J + j] * qpos[count[_C_JOINTS + j]]
             vl += table[_T_J + j] * qvel[count[_C_JOINTS + j]]
-        q, v = ql, vl
-        if wires:
-            q, v = qpos[motor] / r, qvel[motor] / r
-        if k == steps:
+        q, v = qpos[motor] / r, qvel[motor] / r
+        for j in range(count[_C_NQ]):
+            if bad == 0.0 and not (math.isfinite(qpos[j]) and abs(qvel[j]) < _FASTEST):
+                bad = 1.0 + j
+        if k == steps or bad != 0.0:
             break
         begin_step(handle, voltage, q, v)
         x[QL], x[VL], x[LOAD], x[CONTACT] = ql, vl, s[S_LOAD], s[S_CONTACT]
@@ -165,20 +164,16 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
                 applied[at] = y[LOAD_TORQUE] * jacobian
                 friction[at] = max(0.0, table[_T_FRICTION + j] + y[LOAD_FRICTION] * jacobian)
                 damping[at] = max(0.0, table[_T_DAMPING + j] + y[LOAD_DAMPING] * table[_T_W + j])
+        applied[motor] = torque / r
+        friction[motor] = level
+        damping[motor] = viscous
+        # MuJoCo takes the inertia of a body on a single slide from dof_M0, that of any other from dof_armature.
+        armature[motor] = y[INERTIA] / (r * r)
+        mass[motor] = (p[P_INERTIA] + y[INERTIA]) / (r * r)
+        stiffness = p[_WIRE_K] / (1.0 + p[_WIRE_K] * max(0.0, y[COMPLIANCE]) * r * r)
+        pointer_f8(handle[_WIRE_SOLREF])[0] = -stiffness * p[_WIRE_GAIN]
         if wires:
-            applied[motor] = torque / r
-            friction[motor] = level
-            damping[motor] = viscous
-            armature[motor] = y[INERTIA] / (r * r)
             pointer_f8(handle[_WIRE_RANGE])[1] = y[SLACK] * r
-            softer = 1.0 + p[_WIRE_K] * max(0.0, y[COMPLIANCE]) * r * r
-            pointer_f8(handle[_WIRE_SOLREF])[0] = -p[_WIRE_K] / softer * p[_WIRE_GAIN]
-        else:
-            for j in range(N_JOINTS):
-                applied[count[_C_JOINTS + j]] += torque * table[_T_J + j]
-            pointer_f8(handle[_DRIVE_FRICTION])[0] = level
-            pointer_f8(handle[_DRIVE_DAMPING])[0] = viscous
-            pointer_f8(handle[_DRIVE_ARMATURE])[0] = (p[P_INERTIA] + y[INERTIA]) / (r * r)
         if count[_C_PAIRS] > 0:
             pairs = pointer_f8(handle[_PAIR_SOLREF])
             extra = y[OBJECT_DAMPING] / (5.0 * p[_TIP] * p[_TIP])
@@ -190,8 +185,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
         if wires:
             s[S_LOAD] = sensors[count[_C_TENSION]] * r
         else:
-            s[S_LOAD] = torque - (p[P_INERTIA] + y[INERTIA]) * (v - s[_SV]) / dt
-            s[_SV] = v
+            s[S_LOAD] = (stiffness * (q - ql) + p[_WIRE_B] * (v - vl)) * r * r
         s[S_CONTACT] = sensors[count[_C_GRIP]] * p[_TIP] if count[_C_GRIP] >= 0 else 0.0
 
     sense(handle, q, steps)
@@ -200,10 +194,6 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
     for j in range(N_JOINTS):
         out[R_JOINTS + j] = qpos[count[_C_JOINTS + j]]
         out[R_JOINTS + N_JOINTS + j] = qvel[count[_C_JOINTS + j]]
-    bad = 0.0
-    for j in range(count[_C_NQ]):
-        if bad == 0.0 and not (math.isfinite(qpos[j]) and abs(qvel[j]) < _FASTEST):
-            bad = 1.0 + j
     if bad == 0.0:
         warnings = pointer_i8(handle[_WARNINGS])
         for j in range(_N_WARNINGS):
@@ -218,7 +208,8 @@ _compiled = cfunc(ADVANCE_SIGNATURE, cache=True)(_advance)
 def _library() -> ctypes.CDLL:
     """The MuJoCo library that the Python package itself has loaded."""
     folder = Path(mujoco.__file__).parent
-    found = sorted(path for pattern in ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll") for path in folder.glob(pattern))
+    patterns = ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll")
+    found = sorted(path for pattern in patterns for path in folder.glob(pattern))
     if not found:
         raise HannesError(f"No MuJoCo library in {folder}; reinstall the package mujoco.")
     return ctypes.CDLL(str(found[0]))
@@ -250,8 +241,8 @@ class MujocoPlant:
     """
 
     def __init__(self, model: Model, grasp: GraspObject | None = None, *, dt: float = DEFAULT_DT) -> None:
-        if not (math.isfinite(dt) and 0.0 < dt <= 1e-3):
-            raise HannesError(f"The integration step is {dt} s; the multi-body plant needs one in (0, 0.001].")
+        if not (math.isfinite(dt) and 0.0 < dt <= 5e-4):
+            raise HannesError(f"The integration step is {dt} s; the multi-body plant needs one in (0, 0.0005].")
         self.dt = dt
         self.variant = Variant.of(model.variant)
         self.grasp = grasp
@@ -260,7 +251,7 @@ class MujocoPlant:
                                                          "object.damping": grasp.damping}
         self.effects = BoundEffects.of(model.effects)
         self.parameters: NDArray[np.float64] = np.zeros(_N_PARAMETERS)
-        self.states: NDArray[np.float64] = np.zeros(_N_STATES)
+        self.states: NDArray[np.float64] = np.zeros(N_STATE_COMMON)
         self.reading: NDArray[np.float64] = np.zeros(N_READING)
         self._inputs = np.zeros(N_INPUTS)
         self._outputs = np.zeros(N_OUTPUTS)
@@ -299,7 +290,7 @@ class MujocoPlant:
         self._counts: NDArray[np.int64] = np.zeros(_N_COUNTS, dtype=np.int64)
         self._counts[_C_NQ], self._counts[_C_WIRES] = m.nv, int(wires)
         self._counts[_C_JOINTS:] = [m.joint(name).dofadr[0] for name in JOINT_NAMES]
-        self._counts[_C_MOTOR] = m.joint(MOTOR).dofadr[0] if wires else -1
+        self._counts[_C_MOTOR] = m.joint(MOTOR).dofadr[0]
         self._counts[_C_TENSION] = m.sensor(f"tension_{MASTER}").adr[0] if wires else -1
         self._counts[_C_GRIP] = m.sensor("grip_force").adr[0] if self.grasp is not None else -1
         self._counts[_C_PAIRS] = m.npair
@@ -323,20 +314,13 @@ class MujocoPlant:
         addresses = [m._address, d._address, _STEP_ADDRESS, self._counts.ctypes.data, d.qpos.ctypes.data,
                      d.qvel.ctypes.data, d.qfrc_applied.ctypes.data, m.dof_frictionloss.ctypes.data,
                      m.dof_damping.ctypes.data, m.dof_armature.ctypes.data]
-        if wires:
-            wire = m.tendon(MASTER).id
-            p[_WIRE_K] = values.value("wires.master_stiffness")
-            p[_WIRE_GAIN] = -direct_solref(1.0, 0.0, WIRE_IMPEDANCE, float(m.tendon_invweight0[wire]))[0]
-            addresses += [m.tendon_range[wire].ctypes.data, m.tendon_solref_lim[wire].ctypes.data]
-        else:
-            addresses += [spare, spare]
+        wire = m.tendon(MASTER if wires else DRIVE).id
+        p[_WIRE_K], p[_WIRE_B] = values.value("wires.master_stiffness"), values.value("wires.damping")
+        p[_WIRE_GAIN] = -direct_solref(1.0, 0.0, WIRE_IMPEDANCE, float(m.tendon_invweight0[wire]))[0]
+        stretch = m.tendon_solref_lim[wire] if wires else m.eq_solref[m.equality(DRIVE).id]
+        addresses += [m.tendon_range[wire].ctypes.data, stretch.ctypes.data]
         addresses += [m.pair_solref.ctypes.data if m.npair else spare, d.sensordata.ctypes.data if m.nsensor else spare,
-                      d.warning.number.ctypes.data - 4, self._table.ctypes.data]
-        if wires:
-            addresses += [spare] * 3
-        else:
-            drive = m.tendon(DRIVE).id
-            addresses += [a[drive:].ctypes.data for a in (m.tendon_frictionloss, m.tendon_damping, m.tendon_armature)]
+                      d.warning.number.ctypes.data - 4, self._table.ctypes.data, m.dof_M0.ctypes.data]
         self.handle[N_HANDLE_COMMON:] = addresses
 
     # -- parameters ---------------------------------------------------------------------------------------------
@@ -445,51 +429,37 @@ def load_curve(model: Model, grasp: GraspObject | None = None, *, speed: float =
                dt: float = DEFAULT_DT) -> dict[str, NDArray[np.float64]]:
     """Torque that the hand asks of the pulley, closing and opening slowly: what a reduced plant is derived from.
 
-    The motor's side has neither friction nor motor torque here: the pulley is led by a stiff spring-damper along the ramp
-    0 -> hand.travel -> 0 at `speed` [rad/s], and the wire's torque (tension x radius; without wires the leading torque)
-    is recorded.  Half the sum of both directions is the springs and the object, half the difference the dry friction.
+    The motor's own friction is off: the pulley is led by a stiff spring and damper along the ramp
+    0 -> hand.travel -> 0 at `speed` [rad/s], and the torque that leads it is recorded.  Half the sum of both directions
+    is the springs and the object, half the difference the dry friction of joints and carts.
 
-    Returns arrays (samples,): angle [rad], closing [N.m], opening [N.m].
+    Returns arrays (samples,): angle [rad], closing [N.m], opening [N.m], each the mean over a bin of angle, since the
+    joints let go one after the other.
     """
     plant = MujocoPlant(model, grasp, dt=dt)
-    m, d, values = plant.model, plant.data, plant._values
-    radius, travel = values.value("pulley.radius"), values.value("hand.travel")
-    jacobian = plant._table[_T_J:_T_J + N_JOINTS] * radius
-    dofs = plant._counts[_C_JOINTS:]
-    wires = plant.variant.transmission == "wires"
-    if wires:
-        motor = int(plant._counts[_C_MOTOR])
-        m.dof_frictionloss[motor] = m.dof_damping[motor] = 0.0
-    else:
-        drive = m.tendon(DRIVE).id
-        m.tendon_frictionloss[drive] = m.tendon_damping[drive] = 0.0
+    m, d = plant.model, plant.data
+    radius, travel = plant.get("pulley.radius"), model.parameters.value("hand.travel")
+    motor = int(plant._counts[_C_MOTOR])
+    m.dof_frictionloss[motor] = m.dof_damping[motor] = 0.0
     mass = plant.parameters[P_INERTIA] / radius**2
     stiffness, damping = mass * 300.0**2, 2.0 * mass * 300.0
     steps = int(travel / speed / dt)
     angle = np.linspace(0.0, travel, samples)
+    edges = 0.5 * (angle[1:] + angle[:-1])
     curves = []
     for direction in (1, -1):
-        torque = np.empty(steps)
-        at = np.empty(steps)
+        torque, at = np.empty(steps), np.empty(steps)
         for k in range(steps):
-            target = travel * (k / steps if direction > 0 else 1.0 - k / steps)
-            d.qfrc_applied[:] = 0.0
-            if wires:
-                x, v = d.qpos[motor], d.qvel[motor]
-                d.qfrc_applied[motor] = stiffness * (target * radius - x) + damping * (direction * speed * radius - v)
-            else:
-                x, v = float(jacobian @ d.qpos[dofs]), float(jacobian @ d.qvel[dofs])
-                force = stiffness * (target * radius - x) + damping * (direction * speed * radius - v)
-                d.qfrc_applied[dofs] += force * jacobian
+            target = travel * (k / steps if direction > 0 else 1.0 - k / steps) * radius
+            force = stiffness * (target - d.qpos[motor]) + damping * (direction * speed * radius - d.qvel[motor])
+            d.qfrc_applied[motor] = force
             mujoco.mj_step(m, d)
-            torque[k] = (d.sensordata[plant._counts[_C_TENSION]] if wires else force) * radius
-            at[k] = x / radius
-        order = np.argsort(at, kind="stable")
-        # Joints let go one after the other; the mean over a bin is the torque that the motor feels.
-        edges = np.concatenate([[-np.inf], 0.5 * (angle[1:] + angle[:-1]), [np.inf]])
-        bins = np.searchsorted(edges, at[order], side="right") - 1
-        total = np.bincount(bins, weights=torque[order], minlength=samples)[:samples]
-        number = np.bincount(bins, minlength=samples)[:samples]
+            torque[k], at[k] = force * radius, d.qpos[motor] / radius
+        if not np.all(np.isfinite(at)):
+            raise PlantDiverged(f"The load curve diverged near {travel:.1f} rad of pulley; reduce dt.")
+        bins = np.searchsorted(edges, at)
+        number = np.bincount(bins, minlength=samples)
+        total = np.bincount(bins, weights=torque, minlength=samples)
         filled = number > 0
         curves.append(np.interp(angle, angle[filled], total[filled] / number[filled]))
     return {"angle": angle, "closing": curves[0], "opening": curves[1]}

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 os.environ.setdefault("MUJOCO_GL", "egl")
 
 import mujoco
-
 from hannes_description.errors import HannesError
 from hannes_description.joints import JOINT_LIMITS, JOINT_NAMES
 from hannes_description.mjcf import Variant, build_spec
@@ -82,7 +81,8 @@ class HandRenderer:
             raise HannesError(f"Unknown view '{view}'; valid are {', '.join(VIEWS)}.")
         positions = np.asarray(joint_positions, dtype=np.float64)
         if positions.shape != (len(JOINT_NAMES),) or not np.all(np.isfinite(positions)):
-            raise HannesError(f"A picture needs {len(JOINT_NAMES)} finite joint positions, not shape {positions.shape}.")
+            raise HannesError(f"A picture needs {len(JOINT_NAMES)} finite joint positions, not an array of shape "
+                              f"{positions.shape}.")
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._addresses] = positions
         mujoco.mj_forward(self.model, self.data)
