@@ -118,6 +118,7 @@ class Diagnosis:
     simulations: int
     data: tuple[Mapping[str, Any], ...]
     model: Model
+    values: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
         falls = self.falls
@@ -156,7 +157,7 @@ def diagnose(prepared: Prepared, sources: Mapping[str, str], *, jobs: int = 1, p
     tied = _ties(search, best, limits) if verdict == "effects" else ()
     model = fitted_model(prepared.model, search, best) if best.names else prepared.model
     falls = error_falls(prepared, search, best, progress)
-    effects = tuple(_found(search, best, name, limits, falls) for name in best.names)
+    effects = found_effects(search, best, limits, falls)
     experiments = (separating_experiments(prepared, search, [search.found[tuple(sorted(n))] for n in tied])
                    if len(tied) > 1 else ())
     return Diagnosis(
@@ -165,7 +166,8 @@ def diagnose(prepared: Prepared, sources: Mapping[str, str], *, jobs: int = 1, p
             prepared.rig, best.fit.model, best.fit.values)), chance=limits,
         costs={"nominal_fitted": null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
         nuisances=_nuisance_table(best.fit), notes=(*prepared.notes, *_identifiability_notes(best)),
-        simulations=prepared.problem.simulations, data=data_used(prepared.features), model=model)
+        simulations=prepared.problem.simulations, data=data_used(prepared.features), model=model,
+        values=best.fit.values)
 
 
 def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int
@@ -259,6 +261,11 @@ def _found(search: Search, best: Candidate, name: str, limits: Chance, falls: Se
            f"repeatability), with it by {s.rmse:.3g} {s.unit} ({s.ratio:.2f} times). What it looks like: "
            f"{kind.looks_like}.")
     return FoundEffect(name, kind.title, effect_source(kind, search.sources[name]), parameters, why)
+
+
+def found_effects(search: Search, best: Candidate, limits: Chance, falls: Sequence[Fall]) -> tuple[FoundEffect, ...]:
+    """The effects of a fitted set with parameters, intervals and the reason."""
+    return tuple(_found(search, best, name, limits, falls) for name in best.names)
 
 
 def problem_builder(prepared: Prepared, values: Mapping[str, float]) -> Any:

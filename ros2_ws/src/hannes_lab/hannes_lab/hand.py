@@ -12,7 +12,7 @@ from hannes_description.model import Model
 from hannes_description.parameters import data_path, read_yaml
 from hannes_sim.effect import load_class
 from hannes_sim.factory import make_plant
-from hannes_sim.measurement import Sensors, logger
+from hannes_sim.measurement import Sensors, folded_mean, logger, sample_noise
 from hannes_sim.objects import GraspObject, named_object
 from hannes_sim.plant import Plant
 from hannes_sim.rollout import Controller, Rollout, rollout
@@ -45,11 +45,13 @@ def sensors_of(trial: Trial) -> dict[str, Any]:
     given = trial.options.get("sensors")
     if isinstance(given, Mapping):
         sensors = Sensors.from_dict(given)
-        return {"rectified": sensors.current_rectified, "window": sensors.current_window}
+        return {"rectified": sensors.current_rectified, "window": sensors.current_window,
+                "noise": sensors.current_noise}
     if "motor_current" not in trial.signals:
-        return {"rectified": False, "window": 0.0}
+        return {"rectified": False, "window": 0.0, "noise": 0.0}
     values = trial.signals["motor_current"][1]
-    return {"rectified": bool(values.min() >= -0.01 * max(values.max(), 1e-9)), "window": 0.0}
+    return {"rectified": bool(values.min() >= -0.01 * max(values.max(), 1e-9)), "window": 0.0,
+            "noise": sample_noise(values)}
 
 
 class HandRig:
@@ -101,6 +103,8 @@ class HandRig:
         run = self.run(model, values, trial, reference)
         logged = self._sensors[trial.name]
         current = logger(run.motor_current, trial.period, rectified=logged["rectified"], window=logged["window"])
+        if logged["rectified"]:
+            current = folded_mean(current, logged["noise"])
         return {"encoder_position": run.encoder_position, "motor_current": current, "motor_voltage": run.motor_voltage,
                 "grip_force": run.grip_force, "motor_effort": run.motor_effort}
 

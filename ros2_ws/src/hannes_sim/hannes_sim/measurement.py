@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from hannes_description.errors import HannesError
 
@@ -117,6 +118,25 @@ def logger(current: Array, period: float, *, rectified: bool, window: float) -> 
     last = np.arange(1, values.size + 1)
     first = np.maximum(last - width, 0)
     return (total[last] - total[first]) / (last - first)
+
+
+def folded_mean(current: Array, noise: float) -> Array:
+    """Mean of |current + n| for normal noise n of standard deviation `noise`: what a rectified log shows on average.
+
+    The folded normal distribution (Leone, Nelson, Nottingham 1961); near zero current a rectified log never averages to
+    zero.
+    """
+    if noise <= 0.0:
+        return np.abs(current)
+    u = current / noise
+    return noise * math.sqrt(2.0 / math.pi) * np.exp(-0.5 * u * u) + current * erf(u / math.sqrt(2.0))
+
+
+def sample_noise(values: Array) -> float:
+    """Standard deviation of the noise of one sample of a log, from its second differences (robust; smooth signals)."""
+    if values.size < 8:
+        return 0.0
+    return float(np.median(np.abs(np.diff(values, 2))) / 0.6745 / math.sqrt(6.0))
 
 
 THESIS = Sensors()

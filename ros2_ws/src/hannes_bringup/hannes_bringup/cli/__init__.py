@@ -37,6 +37,11 @@ COMMANDS: tuple[Command, ...] = (
     Command("play", "hannes_bringup.cli.bags:play", "Play a bag back onto the topics, with /clock."),
     Command("info", "hannes_bags.cli:info", "Show what a bag holds, and that it is intact."),
     Command("recover", "hannes_bringup.cli.bags:recover", "Save what is left of a cut or damaged bag."),
+    Command("compare", "hannes_lab.cli:compare", "Compare the model with recorded closures: where does it fail?"),
+    Command("diagnose", "hannes_lab.cli:diagnose", "Which physical effect does the model lack?"),
+    Command("add", "hannes_lab.cli:add", "Add effects to the model, fit them, show the error fall."),
+    Command("hide", "hannes_lab.cli:hide", "Make a measurement set with a hidden effect."),
+    Command("report", "hannes_lab.cli:report", "Compare, diagnose and add, on one HTML page."),
     Command("model", "hannes_bringup.cli.model:app", "Show models: parameters with provenance, effects."),
     Command("stiffness", "hannes_stiffness.cli:app", "Train and test the classifier of the grasped object."),
 )
