@@ -148,14 +148,22 @@ class ParameterSet(Mapping[str, Parameter]):
         return cls(entries, where)
 
 
+MAX_YAML_BYTES = 4_000_000
+
+
 def read_yaml(path: Path, what: str) -> Any:
-    """Read YAML safely; one clear error for a missing, unreadable or broken file."""
+    """Read YAML safely; one clear error for a missing, unreadable, oversized or broken file.
+
+    The pure Python loader: libyaml's crashes on deep nesting.
+    """
     try:
+        if path.stat().st_size > MAX_YAML_BYTES:
+            raise HannesError(f"{what} '{path}' has more than {MAX_YAML_BYTES} bytes; that is no such file.")
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise HannesError(f"Cannot read {what} '{path}': {error}.") from error
     try:
-        return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        return yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise HannesError(f"{what} '{path}' is not valid YAML: {str(error).splitlines()[0]}.") from error
 
