@@ -136,7 +136,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
     qpos, qvel, applied = pointer_f8(handle[_QPOS]), pointer_f8(handle[_QVEL]), pointer_f8(handle[_APPLIED])
     friction, damping = pointer_f8(handle[_FRICTION]), pointer_f8(handle[_DAMPING])
     armature, mass, sensors = pointer_f8(handle[_ARMATURE]), pointer_f8(handle[_MASS]), pointer_f8(handle[_SENSORS])
-    r, dt, motor = p[_RADIUS], p[P_DT], count[_C_MOTOR]
+    r, motor = p[_RADIUS], count[_C_MOTOR]
     wires = count[_C_WIRES] != 0
     q = ql = v = vl = bad = 0.0
     for k in range(steps + 1):

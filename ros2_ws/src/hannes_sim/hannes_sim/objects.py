@@ -58,7 +58,7 @@ class GraspObject:
 
 
 SOFT_BALL = GraspObject(shape="sphere", size=0.080, stiffness=400.0, damping=2.0, place=(-0.012, -0.002, 0.004))
-"""A ball that deforms visibly (thesis P18): about 0.4 kN/m in all; so large that all fingers but the little reach it."""
+"""A ball that deforms visibly (thesis P18): about 0.4 kN/m in all; all fingers but the little one reach it."""
 
 RIGID_DYNAMOMETER = GraspObject(shape="capsule", size=0.065, stiffness=40000.0, damping=20.0)
 """A hand dynamometer (thesis P17): at least 40 kN/m."""

@@ -57,7 +57,8 @@ class HandRenderer:
         spec.visual.headlight.specular = [0.25, 0.25, 0.25]
         spec.visual.map.znear, spec.visual.map.zfar = 0.02, 30.0
         spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384,
-                         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=[0.97, 0.975, 0.98], rgb2=[0.80, 0.83, 0.87])
+                         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=[0.97, 0.975, 0.98],
+                         rgb2=[0.80, 0.83, 0.87])
         for place, direction, strength in (((0.4, 0.5, 0.6), (-0.5, -0.6, -0.7), 0.55),
                                            ((0.5, -0.4, 0.2), (-0.7, 0.6, -0.2), 0.25)):
             spec.worldbody.add_light(pos=list(place), dir=list(direction), diffuse=[strength] * 3,
@@ -69,8 +70,8 @@ class HandRenderer:
         try:
             self._renderer = mujoco.Renderer(self.model, height, width)
         except Exception as error:  # the OpenGL back ends raise types of their own
-            raise HannesError(f"No offscreen OpenGL for pictures ({type(error).__name__}: {error}); install libegl1 or set "
-                              "MUJOCO_GL=osmesa.") from error
+            raise HannesError(f"No offscreen OpenGL for pictures ({type(error).__name__}: {error}); install libegl1 or "
+                              "set MUJOCO_GL=osmesa.") from error
         self._options = mujoco.MjvOption()
         self._options.flags[mujoco.mjtVisFlag.mjVIS_TENDON] = False
         self._options.sitegroup[:] = 0
