@@ -108,7 +108,8 @@ class Search:
                 shapes.append([(c.name, c.z(v)) for v in (p.starts or (p.typical,))])
             else:
                 low, high = c.bounds
-                strengths.append([(c.name, z) for s in STRENGTHS for z in (s, -s) if low <= z <= high])
+                points = [c.z(v) for v in p.starts] or [z for s in STRENGTHS for z in (s, -s)]
+                strengths.append([(c.name, z) for z in points if low <= z <= high])
         trials: list[dict[str, float]] = []
         for shape in itertools.product(*shapes):
             for group in strengths:

@@ -38,7 +38,8 @@ class EffectParameter:
     lower, upper   bounds of the search; what physics allows
     typical        a value that a hand may show; sets the scale of the search
     vanishing      the value at which the effect contributes exactly nothing, or None for a shape parameter
-    starts         values from which a search starts, for a parameter in which the error has several minima
+    starts         values from which a search starts, where the error has several minima; without them a strength is
+                   searched at multiples of its typical value
     description    what it is
     """
 

@@ -1,0 +1,83 @@
+"""The control law: limits, anti-windup, battery saver, and the same numbers compiled and in Python."""
+
+import numpy as np
+import pytest
+from hannes_control.double_pid import N_STATES, DoublePID, DoublePIDParameters, control
+from hannes_control.reference import FULL_CLOSURE, half_sine, make_profile, ramp_hold, reversals
+from hannes_description.control_ports import C_CURRENT, C_PERIOD, C_POSITION, C_REFERENCE, N_CONTROL_INPUTS
+from hannes_description.errors import HannesError
+from hannes_description.parameters import load_parameters
+
+
+@pytest.fixture
+def law() -> DoublePID:
+    return DoublePID.of_model(load_parameters("hannes"))
+
+
+def test_compiled_law_equals_plain_python(law: DoublePID) -> None:
+    rng = np.random.default_rng(0)
+    states = np.zeros(N_STATES)
+    x = np.zeros(N_CONTROL_INPUTS)
+    x[C_PERIOD] = law.period
+    for _ in range(500):
+        reference, position, current = rng.normal(5, 4), rng.normal(5, 4), rng.normal(0, 2)
+        x[C_REFERENCE], x[C_POSITION], x[C_CURRENT] = reference, position, current
+        assert law.update(reference, position, current) == pytest.approx(control(x, law.parameters, states), abs=1e-12)
+
+
+def test_limits_hold_and_integrator_does_not_wind_up(law: DoublePID) -> None:
+    for _ in range(3000):
+        voltage = law.update(100.0, 0.0, 0.0)
+        assert abs(voltage) <= 12.0
+        assert abs(law.current_reference) <= 4.6
+    # A wound-up integrator would hold the limit long after the error has changed its sign.
+    after = [law.update(-100.0, 0.0, 0.0) for _ in range(20)]
+    assert after[-1] < 0.0
+
+
+def test_battery_saver_drops_and_releases(law: DoublePID) -> None:
+    settings = law.settings
+    ticks = round((settings.saver_time + 0.1) / law.period)
+    for _ in range(ticks):
+        law.update(10.0, 3.0, settings.saver_current + 0.2)
+    assert law.saving
+    for _ in range(50):
+        law.update(10.0, 3.0, 0.0)
+    assert law.saving and law.current_reference == pytest.approx(0.0)
+    law.update(10.0 - 1.5 * settings.saver_release, 3.0, 0.0)
+    assert not law.saving and law.current_reference > 0.0
+
+
+def test_reset_clears_everything(law: DoublePID) -> None:
+    first = [law.update(5.0, 0.0, 0.1) for _ in range(10)]
+    law.reset()
+    assert [law.update(5.0, 0.0, 0.1) for _ in range(10)] == first
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_non_finite_input_is_refused(law: DoublePID, bad: float) -> None:
+    with pytest.raises(HannesError, match="not finite"):
+        law.update(bad, 0.0, 0.0)
+
+
+def test_parameters_are_checked() -> None:
+    good = DoublePIDParameters.from_parameters(load_parameters("hannes"))
+    with pytest.raises(HannesError, match="kp"):
+        DoublePIDParameters(**{**good.__dict__, "kp": -1.0})
+    with pytest.raises(HannesError, match="voltage_limit"):
+        DoublePIDParameters(**{**good.__dict__, "voltage_limit": 0.0})
+
+
+def test_profiles() -> None:
+    sine = half_sine(2)
+    assert sine.max() == pytest.approx(FULL_CLOSURE, rel=1e-6) and sine.min() == 0.0 and sine.size == 8000
+    assert np.all(sine[2001:3999] == 0.0)
+    ramp = ramp_hold(1, 10.0, 1.0, 0.5, 1.0, 0.5)
+    assert np.all(ramp[1000:1500] == 10.0) and np.abs(np.diff(ramp)).max() < 0.02
+    assert np.any(np.diff(reversals()[:1500]) < 0.0), "reversals must reverse while closing"
+    with pytest.raises(HannesError, match=r"half_sine, ramp_hold, reversals"):
+        make_profile("square")
+    with pytest.raises(HannesError, match="amplitude"):
+        make_profile("half_sine", amplitude=-1.0)
+    with pytest.raises(HannesError, match="speed"):
+        make_profile("half_sine", speed=2.0)

@@ -1,0 +1,141 @@
+"""The catalogue: every effect vanishes exactly, moves an output, and is the same function compiled and in Python."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hannes_control.double_pid import DoublePID
+from hannes_control.reference import half_sine
+from hannes_description.errors import HannesError
+from hannes_description.model import Model
+from hannes_sim.effect import Effect, EffectParameter, catalogue, evaluate, load_effect
+from hannes_sim.factory import make_plant
+from hannes_sim.objects import OBJECTS
+from hannes_sim.ports import CURRENT, DAMPING, DT, FRICTION, LOAD, QL, RESISTANCE, SLACK, V
+from hannes_sim.rollout import Rollout, rollout
+
+NAMES = sorted(catalogue())
+EXPECTED = {
+    "viscous_friction", "coulomb_friction", "stribeck_friction", "load_dependent_friction",
+    "direction_dependent_friction", "wire_slack", "wire_elasticity", "glove_stiffness", "glove_hysteresis",
+    "gearbox_inertia", "gear_backlash", "cogging", "gravity", "return_preload", "winding_heating", "supply_sag",
+    "brush_drop", "current_sensor", "encoder_offset", "encoder_eccentricity", "command_delay", "object_damping",
+}
+
+
+def runs(model: Model) -> list[Rollout]:
+    law = DoublePID.of_model(model.parameters)
+    return [rollout(make_plant(model, OBJECTS[grasp]), law, half_sine(1, period=period), joints=False)
+            for period, grasp in ((2.0, "none"), (2.0, "rigid"))]
+
+
+@pytest.fixture(scope="module")
+def nominal() -> list[Rollout]:
+    return runs(Model.load())
+
+
+def test_catalogue_has_what_the_design_lists() -> None:
+    assert set(NAMES) >= EXPECTED
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_vanishes_exactly(name: str, nominal: list[Rollout]) -> None:
+    effect = load_effect(name)
+    off = effect.entry({p.name: p.vanishing for p in effect.parameters if p.vanishing is not None})
+    for a, b in zip(runs(Model.load().with_effect(off)), nominal, strict=True):
+        assert np.array_equal(a.raw, b.raw) and np.array_equal(a.motor_voltage, b.motor_voltage)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_parameter_moves_an_output(name: str) -> None:
+    """A parameter that does nothing is an error (it would be fitted to noise)."""
+    effect = load_effect(name)
+    strong = {p.name: p.typical if p.typical != p.vanishing else 0.5 * (p.typical + p.upper) for p in effect.parameters}
+    base = runs(Model.load().with_effect(effect.entry(strong)))
+    for p in effect.parameters:
+        value = p.vanishing if p.vanishing is not None else min(p.upper, 1.7 * strong[p.name])
+        moved = runs(Model.load().with_effect(effect.entry({**strong, p.name: value})))
+        change = max(np.abs(a.raw - b.raw).max() for a, b in zip(base, moved, strict=True))
+        assert change > 1e-6, f"{name}.{p.name} moves nothing"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_declaration_is_complete(name: str) -> None:
+    effect = load_effect(name)
+    assert effect.title and effect.looks_like and effect.told_by
+    assert "Equation:" in (effect.__doc__ or "") and "Limits:" in (effect.__doc__ or "")
+    assert all(p.unit and p.description for p in effect.parameters)
+
+
+def test_equations_by_hand() -> None:
+    """Values worked out from the equations of the docstrings, not taken from a run."""
+    assert evaluate(load_effect("viscous_friction"), {"coefficient": 2e-3}, {})[DAMPING] == 2e-3
+    assert evaluate(load_effect("wire_slack"), {"slack": 0.7}, {})[SLACK] == 0.7
+    stribeck = {"stiction": 0.02, "velocity": 2.0}
+    assert evaluate(load_effect("stribeck_friction"), stribeck, {V: 2.0})[FRICTION] == pytest.approx(0.02 / math.e)
+    assert evaluate(load_effect("load_dependent_friction"), {"coefficient": 0.1}, {LOAD: 0.3})[FRICTION] == pytest.approx(0.03)
+    glove = evaluate(load_effect("glove_stiffness"), {"stiffness": 1e-3, "hardening": 1e-6}, {QL: 10.0})
+    assert glove.sum() == pytest.approx(-(1e-3 * 10 + 1e-6 * 1000))
+    states = np.zeros(1)
+    for _ in range(200_000):
+        evaluate(load_effect("winding_heating"), {"thermal_resistance": 10.0, "time_constant": 5.0},
+                 {CURRENT: 1.0, RESISTANCE: 1.5, DT: 1e-3}, states)
+    # T = Rth R i2 / (1 - alpha Rth R i2): the resistance grows with the temperature
+    assert states[0] == pytest.approx(15.0 / (1 - 0.0039 * 15.0), rel=1e-3)
+
+
+def test_own_effect_from_a_file(tmp_path: Path, nominal: list[Rollout]) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from hannes_sim.effect import Effect, EffectParameter\n"
+        "from hannes_sim.ports import TORQUE, QL\n\n\n"
+        "class Spring(Effect):\n"
+        "    name = 'my_spring'\n"
+        "    parameters = (EffectParameter('k', 'N.m/rad', 0.0, 0.1, 1e-3, 0.0, 'rate'),)\n\n"
+        "    @staticmethod\n"
+        "    def contribute(x, p, s, y):\n"
+        "        y[TORQUE] -= p[0] * x[QL]\n")
+    source = f"{file}:Spring"
+    effect = load_effect(source)
+    model = Model.load().with_effect(effect.entry({"k": 2e-3}, source=source))
+    path = model.save(tmp_path / "model.yaml")
+    assert Model.load(path).sha256 == model.sha256
+    changed = runs(Model.load(path))
+    assert np.abs(changed[0].encoder_position - nominal[0].encoder_position).max() > 0.05
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("class A:\n    pass\n", "not a subclass"),
+    ("import nothing_like_this\nclass A: pass\n", "cannot be imported"),
+    ("from hannes_sim.effect import Effect\nclass A(Effect):\n    name='a'\n", "declares no parameters"),
+])
+def test_broken_effect_files_give_one_clear_error(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / f"broken_{abs(hash(text))}.py"
+    file.write_text(text)
+    with pytest.raises(HannesError, match=message):
+        load_effect(f"{file}:A")
+
+
+def test_uncompilable_effect_names_itself() -> None:
+    class Bad(Effect):
+        name = "bad_effect"
+        parameters = (EffectParameter("k", "1", 0.0, 1.0, 0.5, 0.0, ""),)
+
+        @staticmethod
+        def contribute(x, p, s, y):  # type: ignore[no-untyped-def]
+            y["word"] = open("nothing")
+
+    from hannes_sim.effect import compile_effect
+
+    with pytest.raises(HannesError, match="bad_effect"):
+        compile_effect(Bad)
+
+
+def test_unknown_effect_and_parameter_list_the_valid_ones() -> None:
+    with pytest.raises(HannesError, match="wire_slack"):
+        load_effect("wire_slak")
+    with pytest.raises(HannesError, match="slack"):
+        load_effect("wire_slack").entry({"slak": 1.0})
+    with pytest.raises(HannesError, match="outside"):
+        load_effect("wire_slack").entry({"slack": -1.0})

@@ -1,0 +1,137 @@
+"""What every plant promises: units, determinism, rest, limits, sign of the motion; run on each plant and variant."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hannes_control.double_pid import DoublePID
+from hannes_control.reference import half_sine
+from hannes_description.errors import HannesError
+from hannes_description.model import Model
+from hannes_sim.effect import load_effect
+from hannes_sim.factory import make_plant
+from hannes_sim.objects import RIGID_DYNAMOMETER, SOFT_BALL
+from hannes_sim.plant import Plant
+from hannes_sim.rollout import VoltagePlayback, rollout
+
+MODELS: dict[str, Callable[[], Model]] = {
+    "reduced": lambda: Model.load("nominal"),
+    "mujoco": lambda: Model.load("nominal_mujoco"),
+    "mujoco-torsion": lambda: _variant(return_mechanism="torsion_spring"),
+    "mujoco-forces": lambda: _variant(transmission="forces"),
+}
+
+
+def _variant(**options: str) -> Model:
+    from dataclasses import replace
+
+    model = Model.load("nominal_mujoco")
+    return replace(model, variant={**model.variant, **options})
+
+
+@pytest.fixture(params=list(MODELS))
+def model(request: pytest.FixtureRequest) -> Model:
+    return MODELS[request.param]()
+
+
+@pytest.fixture
+def plant(model: Model) -> Plant:
+    return make_plant(model)
+
+
+def test_stays_at_rest_without_voltage(plant: Plant) -> None:
+    plant.reset()
+    plant.advance(0.0, 4000)
+    reading = plant.read()
+    assert reading.time == pytest.approx(4000 * plant.dt)
+    assert abs(reading.position) < 0.05 and abs(reading.current) < 1e-3 and reading.grip_force == 0.0
+    assert reading.joint_positions.shape == (13,) and np.isfinite(reading.joint_positions).all()
+
+
+def test_positive_voltage_closes(plant: Plant) -> None:
+    plant.reset()
+    plant.advance(6.0, 800)
+    reading = plant.read()
+    assert reading.position > 1.0 and reading.velocity > 0.0 and reading.current > 0.0
+    assert reading.joint_positions[1] > 0.01, "the index must flex"
+
+
+def test_voltage_is_clamped_to_the_supply(plant: Plant) -> None:
+    plant.reset()
+    plant.advance(12.0, 200)
+    at_supply = plant.read().position
+    plant.reset()
+    plant.advance(1000.0, 200)
+    assert plant.read().position == at_supply
+
+
+def test_reset_repeats_bit_for_bit(plant: Plant, model: Model) -> None:
+    law = DoublePID.of_model(model.parameters)
+    reference = half_sine(1, amplitude=8.0, period=1.0)
+    first, second = rollout(plant, law, reference), rollout(plant, law, reference)
+    assert np.array_equal(first.raw, second.raw) and np.array_equal(first.motor_voltage, second.motor_voltage)
+
+
+def test_stepwise_equals_rollout(plant: Plant, model: Model) -> None:
+    """The node's way (one advance a tick) and the rollout's give the same trajectory."""
+    law = DoublePID.of_model(model.parameters)
+    reference = half_sine(1, amplitude=8.0, period=0.6)
+    run = rollout(plant, law, reference)
+    plant.reset()
+    law.reset()
+    steps = round(law.period / plant.dt)
+    for k, wanted in enumerate(reference):
+        reading = plant.read()
+        assert reading.position == run.encoder_position[k] and reading.current == run.motor_current[k]
+        voltage = law.update(float(wanted), reading.position, reading.current)
+        assert voltage == run.motor_voltage[k]
+        plant.advance(voltage, steps)
+
+
+def test_object_stops_the_hand_and_feels_force(model: Model) -> None:
+    law = DoublePID.of_model(model.parameters)
+    reference = half_sine(1, period=2.0)
+    free = rollout(make_plant(model), law, reference)
+    soft = rollout(make_plant(model, SOFT_BALL), law, reference)
+    rigid = rollout(make_plant(model, RIGID_DYNAMOMETER), law, reference)
+    assert free.grip_force.max() == 0.0
+    assert rigid.grip_force.max() > soft.grip_force.max() > 1.0
+    assert rigid.encoder_position.max() < soft.encoder_position.max() < free.encoder_position.max()
+    assert rigid.motor_current.max() > 2.0 * free.motor_current.max()
+
+
+def test_effects_act_on_every_plant(model: Model) -> None:
+    """Drive-side effects are the same functions in both plants and move the current the same way."""
+    law = DoublePID.of_model(model.parameters)
+    reference = half_sine(1, amplitude=10.0, period=2.0)
+    base = rollout(make_plant(model), law, reference)
+    for name, values in (("viscous_friction", {"coefficient": 3e-3}), ("coulomb_friction", {"level": 0.02}),
+                         ("glove_stiffness", {"stiffness": 4e-3, "hardening": 0.0})):
+        run = rollout(make_plant(model.with_effect(load_effect(name).entry(values))), law, reference)
+        closing = slice(200, 450)
+        assert run.motor_current[closing].mean() > 1.1 * base.motor_current[closing].mean(), name
+
+
+def test_open_loop_playback_reproduces_the_closed_loop(plant: Plant, model: Model) -> None:
+    law = DoublePID.of_model(model.parameters)
+    closed = rollout(plant, law, half_sine(1, amplitude=8.0, period=0.8))
+    opened = rollout(plant, VoltagePlayback(law.period), closed.motor_voltage)
+    assert np.array_equal(closed.raw, opened.raw)
+
+
+def test_set_and_get_are_one(plant: Plant) -> None:
+    for name in ("motor.resistance", "motor.kt", "friction.coulomb", "friction.viscous", "encoder.zero"):
+        plant.set(name, 1.25 * plant.get(name) + 1e-4)
+        before = plant.get(name)
+        plant.set(name, before)
+        assert plant.get(name) == before
+    with pytest.raises(HannesError, match=r"motor\.resistance"):
+        plant.set("motor.resistanse", 1.0)
+
+
+def test_bad_step_and_reference_are_refused(model: Model) -> None:
+    with pytest.raises(HannesError, match="step"):
+        make_plant(model, dt=float("nan"))
+    plant, law = make_plant(model), DoublePID.of_model(model.parameters)
+    with pytest.raises(HannesError, match="not finite at sample 3"):
+        rollout(plant, law, np.array([0.0, 0.0, 0.0, np.nan]))
