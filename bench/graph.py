@@ -2,8 +2,8 @@
 
 Times the loop alone (hand_sim and motor_controller) and the whole chain from EMG, as separate processes and composed in
 one, beside the same closed loop in process. Prints ratios to real time, and where the time of a tick goes: the plant
-and the law (from the rollout), other computing (from the CPU time of the processes), and waiting for messages
-and threads.
+and the law (from the rollout), other computing (from the CPU time of the processes), and waiting for messages,
+threads and, where other programs run, a core.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def limit(result: Result, plant_us: float) -> str:
     floor = result.cpu_us / cores if result.kind == "processes" else result.cpu_us
     parts = {"the plant and the law": plant_us,
              "computing in the nodes and the middleware": max(0.0, floor - plant_us),
-             "thread wake-ups between messages": max(0.0, result.tick_us - max(floor, plant_us))}
+             "waiting for messages, threads and a free core": max(0.0, result.tick_us - max(floor, plant_us))}
     name = max(parts, key=lambda key: parts[key])
     return f"{name} ({parts[name]:.0f} of {result.tick_us:.0f} us)"
 

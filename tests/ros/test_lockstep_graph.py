@@ -21,8 +21,8 @@ TICKS = 800
 SIGNALS = ("encoder_position", "motor_current", "motor_voltage", "reference_position")
 
 
-def in_process(reference: np.ndarray, grasp: str) -> Rollout:
-    model = Model.load("nominal")
+def in_process(reference: np.ndarray, grasp: str, plant: str = "reduced") -> Rollout:
+    model = Model.load("nominal").with_plant(plant)
     return rollout(make_plant(model, named_object(grasp)), DoublePID.of_model(model.parameters), reference)
 
 
@@ -57,12 +57,13 @@ def assert_equal(heard: dict[str, np.ndarray], expected: Rollout) -> None:
         np.testing.assert_array_equal(heard[name], expected.signal(name), err_msg=name)
 
 
-@pytest.mark.parametrize("kind", ["processes", "composed"])
-def test_simulator_and_controller_equal_the_rollout_bit_for_bit_twice(peer, kind):
+@pytest.mark.parametrize(("kind", "plant"), [("processes", "reduced"), ("composed", "reduced"),
+                                             ("composed", "mujoco")])
+def test_simulator_and_controller_equal_the_rollout_bit_for_bit_twice(peer, kind, plant):
     peer.hear(*SIGNALS)
     # One more subscriber than the loop needs: the peer must not miss the first tick.
-    sim = {"clock": "lockstep", "duration": SECONDS, "subscribers": 2, "object": "soft"}
-    control = {"clock": "lockstep", "reference": "half_sine", "reference_period": 1.6}
+    sim = {"clock": "lockstep", "duration": SECONDS, "subscribers": 2, "object": "soft", "plant": plant}
+    control = {"clock": "lockstep", "reference": "half_sine", "reference_period": 1.6, "subscribers": 2}
     runs = []
     for _ in range(2):
         if kind == "processes":
@@ -74,7 +75,7 @@ def test_simulator_and_controller_equal_the_rollout_bit_for_bit_twice(peer, kind
         runs.append(run_graph(peer, *nodes))
     for name, values in runs[0].items():
         np.testing.assert_array_equal(values, runs[1][name], err_msg=name)
-    assert_equal(runs[0], in_process(half_sine(period=1.6)[:TICKS], "soft"))
+    assert_equal(runs[0], in_process(half_sine(period=1.6)[:TICKS], "soft", plant))
     assert runs[0]["motor_voltage"].max() > 1.0
 
 
@@ -85,8 +86,8 @@ def test_the_whole_chain_from_emg_equals_the_rollout(peer, kind):
     samples = [k * 300 // 1000 for k in range(TICKS)]  # the last sample with a time <= k ms
     reference = emg_reference(emg.flexor, emg.extensor).reference[samples]
     assert reference[-1] > 1.0
-    own = {"hand_sim": {"duration": SECONDS, "subscribers": 4}, "emg_source": {"seed": 5}, "emg_reference": {},
-           "motor_controller": {}}
+    own = {"hand_sim": {"duration": SECONDS, "subscribers": 4}, "emg_source": {"seed": 5},
+           "emg_reference": {"subscribers": 2}, "motor_controller": {"subscribers": 2}}
     if kind == "processes":
         order = ("emg_source", "emg_reference", "motor_controller", "hand_sim")
         nodes = [NodeProcess(name, clock="lockstep", **own[name]) for name in order]

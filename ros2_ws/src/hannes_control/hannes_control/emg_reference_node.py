@@ -29,6 +29,8 @@ class EmgReferenceParameters:
     """ROS parameters of emg_reference; see EmgParameters for their meaning."""
 
     clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
+    subscribers: int = parameter(1, "subscribers that reference_position must have before the first answer in lockstep",
+                                 lower=1, upper=100)
     rate: int = parameter(int(_DEFAULT.rate), "rate of both channels", lower=100, upper=2000, unit="Hz")
     full_scale: float = parameter(_DEFAULT.full_scale, "envelope of a full contraction; thresholds are fractions of it",
                                   lower=1e-9, upper=1e6, unit="V")
@@ -70,7 +72,8 @@ class EmgReferenceNode(HannesNode, Node):
         self._health = Health("rejected_samples", "rejected_states")
         self._reference = topics.publisher(self, "reference_position")
         self._lockstep = p.clock == "lockstep"
-        self._peers = Peers({"a subscriber of reference_position": (self._reference.get_subscription_count, 1)})
+        self._peers = Peers({f"{p.subscribers} subscriber(s) of reference_position": (
+            self._reference.get_subscription_count, p.subscribers)})
         topics.subscription(self, "emg_flexor", lambda data: self._on_emg(0, data))
         topics.subscription(self, "emg_extensor", lambda data: self._on_emg(1, data))
         if self._lockstep:

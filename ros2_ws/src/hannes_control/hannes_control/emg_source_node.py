@@ -29,6 +29,8 @@ class EmgSourceParameters:
     rate: int = parameter(300, "rate of the samples; a file of another rate is resampled", lower=100, upper=2000,
                           unit="Hz")
     clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
+    subscribers: int = parameter(1, "subscribers that each channel must have before the first sample in lockstep",
+                                 lower=1, upper=100)
     seed: int = parameter(0, "seed of the synthetic EMG", lower=0, upper=2**31)
     closures: int = parameter(1, "closures of the synthetic EMG", lower=1, upper=100000)
     close_time: float = parameter(1.6, "contraction of the flexor", lower=0.1, upper=100.0, unit="s")
@@ -69,8 +71,9 @@ class EmgSource(HannesNode, Node):
         self._flexor = topics.publisher(self, "emg_flexor")
         self._extensor = topics.publisher(self, "emg_extensor")
         self._lockstep = p.clock == "lockstep"
-        self._peers = Peers({"a subscriber of emg/flexor": (self._flexor.get_subscription_count, 1),
-                             "a subscriber of emg/extensor": (self._extensor.get_subscription_count, 1)})
+        self._peers = Peers({
+            f"{p.subscribers} subscriber(s) of emg/flexor": (self._flexor.get_subscription_count, p.subscribers),
+            f"{p.subscribers} subscriber(s) of emg/extensor": (self._extensor.get_subscription_count, p.subscribers)})
         self._loop = RealtimeLoop(1.0 / p.rate, self._step)
         self._diagnostics = Diagnostics(self, self._health, self._status)
         self.wall_timer(_CHECK_S, self._check)

@@ -39,6 +39,8 @@ class MotorControllerParameters:
     reference_amplitude: float = parameter(FULL_CLOSURE, "amplitude of the profile", lower=1e-3, upper=100.0,
                                            unit="rad")
     reference_period: float = parameter(0.0, "period of the profile, 0 for its own", lower=0.0, upper=1e3, unit="s")
+    subscribers: int = parameter(1, "subscribers that motor/voltage must have before the first answer in lockstep",
+                                 lower=1, upper=100)
     state_timeout_ms: float = parameter(50.0, "age of motor/state or motor/current from which the command is 0 V",
                                         lower=1.0, upper=1e4, unit="ms")
     pause_limit_ms: float = parameter(100.0, "a pause of the control loop longer than this deactivates the node",
@@ -89,7 +91,8 @@ class MotorController(HannesNode, LifecycleNode):
         if self._profile is None:
             topics.subscription(self, "reference_position",
                                 self._on_tick_reference if self._lockstep else self._on_reference)
-        self._peers = Peers({"a subscriber of motor/voltage": (self._voltage.get_subscription_count, 1)})
+        self._peers = Peers({f"{p.subscribers} subscriber(s) of motor/voltage": (self._voltage.get_subscription_count,
+                                                                                  p.subscribers)})
         self._diagnostics = Diagnostics(self, self._health, self._status)
         self.wall_timer(_CHECK_S, self._check)
         if p.autostart:
@@ -260,8 +263,8 @@ class MotorController(HannesNode, LifecycleNode):
         values: dict[str, object] = {"active": self._active, "battery_saver": self._pid.saving, "reference_age_s": age}
         if not self._active:
             return WARN, "not active: motor off" + ("; activate again" if self._tripped else ""), values
-        if self._lockstep and not self._peers.complete:
-            return WARN, "waiting for a subscriber of motor/voltage", values
+        if self._lockstep and (absent := self._peers.missing()):
+            return WARN, f"waiting for {', '.join(absent)}", values
         names = ("motor/state", "motor/current", "reference_position")
         if self._lockstep:
             missing = [names[slot] for slot in self._join.missing()]

@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from hannes_description.errors import HannesError
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 USAGE_ERROR = 2
 # A signal is noticed when spin_once returns.
 _SPIN_S = 0.1
+_DELIVER_S = 1.0
 
 
 def run_node(*names: str, executor: str = "events", argv: Sequence[str] | None = None) -> int:
@@ -71,6 +73,7 @@ def _run(names: Sequence[str], executor: str, arguments: list[str]) -> int:
     finally:
         for node in reversed(nodes):
             node.stop()
+        _deliver(nodes)
         for node in reversed(nodes):
             node.destroy_node()
         rclpy.try_shutdown(context=context)
@@ -78,6 +81,16 @@ def _run(names: Sequence[str], executor: str, arguments: list[str]) -> int:
     if failures:
         raise HannesError(str(failures[0]))
     return 0
+
+
+def _deliver(nodes: Sequence[Any]) -> None:
+    """Let the last messages reach those who are there, a recorder for one; a dead subscriber holds this up for 1 s."""
+    from rclpy.duration import Duration
+
+    end = monotonic() + _DELIVER_S
+    for node in nodes:
+        for publisher in node.publishers:
+            publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - monotonic())))
 
 
 class _StopOnSignal:

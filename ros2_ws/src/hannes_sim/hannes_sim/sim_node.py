@@ -18,7 +18,6 @@ from hannes_ros.loop import RealtimeLoop
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
-from rclpy.duration import Duration
 from rclpy.node import Node
 
 from .factory import make_plant
@@ -119,10 +118,8 @@ class HandSim(HannesNode, Node):
                                f"{1 / p.period:g} Hz")
 
     def stop(self) -> None:
-        """End the real-time loop; let the last messages arrive."""
+        """End the real-time loop."""
         self._loop.stop()
-        for publisher in (self._state, self._current):
-            publisher.wait_for_all_acked(Duration(seconds=1))
 
     # -- both clocks -------------------------------------------------------------------------------------------------
     def _publish(self, stamp_ns: int) -> None:
@@ -166,6 +163,8 @@ class HandSim(HannesNode, Node):
             "tick": self._tick, "stalls": self._watch.stalls,
             "rejected_commands": gate.rejected, "clamped_commands": gate.clamped, "command_timeouts": gate.timeouts,
             "command_age_at_zero_s": age}
+        if (drivers := self._voltage_publishers()) > 1:
+            return ERROR, f"{drivers} publishers of motor/voltage; only one may drive the motor", values
         if not self._lockstep:
             values["applied_voltage"] = f"{self._applied:.6g}"
             if gate.last_command is None:
