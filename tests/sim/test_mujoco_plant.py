@@ -158,7 +158,8 @@ def test_inertia_adds_to_the_rotor(constant_effects: str) -> None:
 
 def test_set_is_the_same_as_a_model_with_that_value() -> None:
     for name, value in (("motor.resistance", 2.0), ("friction.coulomb", 0.02), ("springs.index_preload", 7.0),
-                        ("pulley.radius", 0.0045), ("wires.master_stiffness", 3e4)):
+                        ("pulley.radius", 0.0045), ("wires.master_stiffness", 3e4), ("hand.preload", 0.02),
+                        ("hand.stiffness", 0.003), ("hand.coulomb", 0.016)):
         plant = MujocoPlant(MODEL)
         plant.set(name, value)
         assert plant.get(name) == value
@@ -179,6 +180,56 @@ def test_every_name_can_be_read_and_a_wrong_one_is_refused() -> None:
         MujocoPlant(MODEL).set("object.stiffness", 1.0)
     with pytest.raises(HannesError, match="integration step"):
         MujocoPlant(MODEL, dt=0.01)
+
+
+@pytest.mark.parametrize("mechanism", ["return_wire", "torsion_spring"])
+def test_preload_rate_and_friction_of_the_hand_scale_the_load_curve(mechanism: str) -> None:
+    model = replace(MODEL, variant={"return_mechanism": mechanism})
+
+    def curve(**values: float) -> tuple[np.ndarray, np.ndarray]:
+        changed = model.with_values({name.replace("_", ".", 1): value for name, value in values.items()})
+        found = load_curve(changed, speed=4.0, samples=30)
+        inside = (found["angle"] > 1.0) & (found["angle"] < 11.0)
+        half_sum, half_difference = found["closing"] + found["opening"], found["closing"] - found["opening"]
+        return 0.5 * half_sum[inside], 0.5 * half_difference[inside]
+
+    springs, friction = curve()
+    preloaded, _ = curve(hand_preload=1.5 * 0.0107)
+    assert np.mean(preloaded - springs) == pytest.approx(0.5 * 0.0107, rel=0.35)
+    stiffer, _ = curve(hand_stiffness=2.0 * 0.0015)
+    assert np.mean(np.diff(stiffer)) > 1.3 * np.mean(np.diff(springs))
+    _, easier = curve(hand_coulomb=0.5 * 0.008)
+    assert np.mean(easier) == pytest.approx(0.5 * np.mean(friction), rel=0.15)
+
+
+def test_a_change_between_closures_leaves_the_state_as_it_is() -> None:
+    plant = MujocoPlant(MODEL, SOFT_BALL)
+    for _ in range(400):
+        plant.advance(4.0, 4)
+    before = plant.read()
+    for name, factor in (("springs.index_preload", 1.1), ("hand.preload", 1.1), ("object.position", 0.98),
+                         ("object.stiffness", 1.2), ("friction.coulomb", 1.1)):
+        plant.set(name, factor * plant.get(name))
+        joints = [plant.data.joint(joint).qpos[0] for joint in JOINT_NAMES]
+        np.testing.assert_array_equal(joints, before.joint_positions)
+    plant.advance(4.0, 4)
+    after = plant.read()
+    assert after.time == pytest.approx(before.time + 1e-3)
+    assert np.abs(after.joint_positions - before.joint_positions).max() < 0.05
+    assert abs(after.position - before.position) < 0.05
+
+
+def test_the_objects_position_is_its_size_and_moves_the_touch() -> None:
+    touched = []
+    for shift in (0.0, -1.0):
+        plant = MujocoPlant(MODEL, RIGID_DYNAMOMETER)
+        plant.set("object.position", plant.get("object.position") + shift)
+        run = rollout(plant, DoublePID.of_model(MODEL.parameters), CLOSURE[:1100])
+        touched.append(run.encoder_position.max())
+        other = replace(RIGID_DYNAMOMETER, size=RIGID_DYNAMOMETER.size - shift * 0.006)
+        again = close(grasp=other, reference=CLOSURE[:1100])
+        np.testing.assert_allclose(run.encoder_position, again.encoder_position, atol=1e-9)
+    assert 0.3 < touched[0] - touched[1] < 2.0
 
 
 def test_divergence_names_the_joint_and_leaves_no_log_file(tmp_path, monkeypatch) -> None:

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.joints import JOINT_LIMITS, JOINT_NAMES
 from hannes_description.mjcf import (
+    CARTS,
     CONTACT_IMPEDANCE,
     DRIVE,
     MASTER,
@@ -231,7 +233,13 @@ _NAMES = {
 }
 _GROUPS = ("geometry", "inertia", "gravity", "pulleys", "springs", "joints", "carts", "wires")
 _REBUILD = ("motor.armature", "gear.ratio", "pulley.radius")
-_OBJECT_NAMES = ("object.stiffness", "object.damping")
+
+_SCALED = {"hand.preload": 0.0107, "hand.stiffness": 0.0015, "hand.coulomb": 0.008}
+"""Parameters at the pulley that the reduced plant has too, with the value for which the groups springs, joints and
+carts are given.  Another value scales all preloads, all rates, or all dry friction of joints and carts alike."""
+
+_OBJECT_NAMES = ("object.stiffness", "object.damping", "object.position")
+"""object.position [rad]: pulley angle at which the object is touched, by its size, as in the reduced plant."""
 
 
 class MujocoPlant:
@@ -247,8 +255,8 @@ class MujocoPlant:
         self.variant = Variant.of(model.variant)
         self.grasp = grasp
         self._values = model.parameters
-        self._initial_object = {} if grasp is None else {"object.stiffness": grasp.stiffness,
-                                                         "object.damping": grasp.damping}
+        self._scaled = {name: self._values.value(name) if name in self._values else given
+                        for name, given in _SCALED.items()}
         self.effects = BoundEffects.of(model.effects)
         self.parameters: NDArray[np.float64] = np.zeros(_N_PARAMETERS)
         self.states: NDArray[np.float64] = np.zeros(N_STATE_COMMON)
@@ -304,7 +312,6 @@ class MujocoPlant:
             self._table[_T_J + k] = arm / radius
             self._table[_T_W + k] = arm / radius**2 * travel / JOINT_LIMITS[name].upper
             self._table[_T_FRICTION + k], self._table[_T_DAMPING + k] = m.dof_frictionloss[dof], m.dof_damping[dof]
-        p[_OBJECT_B] = 0.0 if self.grasp is None else contact_stiffness(self.grasp)[1]
         for k in range(m.npair):
             bodies = m.geom_bodyid[[m.pair_geom1[k], m.pair_geom2[k]]]
             self._table[_T_PAIRS + k] = -direct_solref(0.0, 1.0, CONTACT_IMPEDANCE,
@@ -322,6 +329,50 @@ class MujocoPlant:
         addresses += [m.pair_solref.ctypes.data if m.npair else spare, d.sensordata.ctypes.data if m.nsensor else spare,
                       d.warning.number.ctypes.data - 4, self._table.ctypes.data, m.dof_M0.ctypes.data]
         self.handle[N_HANDLE_COMMON:] = addresses
+        self._given = {"springlength": m.tendon_lengthspring.copy(), "rate": m.tendon_stiffness.copy(),
+                       "springref": m.qpos_spring.copy(), "torsion": m.jnt_stiffness.copy(),
+                       "friction": self._table[_T_FRICTION:_T_DAMPING].copy(), "carts": m.dof_frictionloss.copy()}
+        self._scale()
+        self._shape_object()
+
+    def _scale(self) -> None:
+        """Put hand.preload, hand.stiffness and hand.coulomb into the compiled model."""
+        m, given = self.model, self._given
+        preload, rate, friction = (self._scaled[name] / reference for name, reference in _SCALED.items())
+        if rate <= 0.0:
+            raise HannesError(f"hand.stiffness must be above 0, not {self._scaled['hand.stiffness']} N.m/rad.")
+        # Preload = rate x spring length, so the length takes the preload's factor over the rate's.
+        m.tendon_stiffness[:] = given["rate"] * rate
+        m.tendon_lengthspring[:] = given["springlength"] * (preload / rate)
+        for name in transmission_jacobian(self._values):
+            joint = m.joint(name)
+            m.jnt_stiffness[joint.id] = given["torsion"][joint.id] * rate
+            at = joint.qposadr[0]
+            m.qpos_spring[at] = given["springref"][at] * (preload / rate)
+        self._table[_T_FRICTION:_T_DAMPING] = given["friction"] * friction
+        if self.variant.transmission == "wires":
+            for name in CARTS:
+                dof = m.joint(name).dofadr[0]
+                m.dof_frictionloss[dof] = given["carts"][dof] * friction
+
+    def _shape_object(self) -> None:
+        """Put the object's size, stiffness and damping into the compiled model."""
+        if self.grasp is None:
+            return
+        m = self.model
+        stiffness, damping = contact_stiffness(self.grasp)
+        self.parameters[_OBJECT_B] = damping
+        for k in range(m.npair):
+            m.pair_solref[k, 0] = -stiffness * self._table[_T_PAIRS + k]
+        geom = m.geom("object").id
+        half = 0.5 * self.grasp.size
+        m.geom_size[geom, 0] = half
+        if self.grasp.shape == "box":
+            m.geom_size[geom, 2] = half
+        # The radius of the sphere that holds the geom; collision starts from it.
+        sizes = m.geom_size[geom]
+        m.geom_rbound[geom] = {"sphere": half, "capsule": half + sizes[1],
+                               "box": float(np.linalg.norm(sizes))}[self.grasp.shape]
 
     # -- parameters ---------------------------------------------------------------------------------------------
     @property
@@ -329,10 +380,10 @@ class MujocoPlant:
         effects = tuple(f"{effect}.{parameter}" for effect, parameter in self.effects.index)
         mechanics = tuple(name for name in self._values if name.split(".")[0] in _GROUPS)
         objects = _OBJECT_NAMES if self.grasp is not None else ()
-        return (*_NAMES, *_REBUILD, *objects, *mechanics, *effects)
+        return (*_NAMES, *_SCALED, *_REBUILD, *objects, *mechanics, *effects)
 
     def set(self, name: str, value: float) -> None:
-        """Change a parameter; one of the mechanics rebuilds the multi-body model (10 ms) and resets the plant."""
+        """Change a parameter; the state goes on.  One of the mechanics rebuilds the multi-body model (10 ms)."""
         self.set_many({name: value})
 
     def set_many(self, values: dict[str, float]) -> None:
@@ -345,16 +396,30 @@ class MujocoPlant:
             elif name in _NAMES:
                 self.parameters[_NAMES[name]] = value
             elif name in _OBJECT_NAMES and self.grasp is not None:
-                self.grasp = GraspObject.from_dict({**self.grasp.to_dict(), name.split(".")[1]: value})
-                rebuild = True
+                if name == "object.position":
+                    self.grasp = replace(self.grasp, size=self._opening() - value * self.parameters[_TIP])
+                elif name == "object.stiffness":
+                    self.grasp = replace(self.grasp, stiffness=value)
+                else:
+                    self.grasp = replace(self.grasp, damping=value)
+                self._shape_object()
+            elif name in _SCALED:
+                self._scaled[name] = value
+                self._scale()
             elif name in _REBUILD or (name.split(".")[0] in _GROUPS and name in self._values):
                 self._values = self._values.with_values({name: value})
                 rebuild = True
             else:
                 raise HannesError(f"The MuJoCo plant has no parameter '{name}'; valid are {', '.join(self.names)}.")
         if rebuild:
+            old = self.data
             self._build()
-            self.reset()
+            self.data.time = old.time
+            self.data.qpos[:], self.data.qvel[:] = old.qpos, old.qvel
+            self.data.qacc_warmstart[:] = old.qacc_warmstart
+
+    def _opening(self) -> float:
+        return self._values.value("hand.opening")
 
     def get(self, name: str) -> float:
         """The present value of a parameter that `set` takes."""
@@ -363,6 +428,10 @@ class MujocoPlant:
             return float(self.effects.parameters[self.effects.index[(effect, parameter)]])
         if name in _NAMES:
             return float(self.parameters[_NAMES[name]])
+        if name in _SCALED:
+            return self._scaled[name]
+        if name == "object.position" and self.grasp is not None:
+            return float((self._opening() - self.grasp.size) / self.parameters[_TIP])
         if name in _OBJECT_NAMES and self.grasp is not None:
             return float(getattr(self.grasp, name.split(".")[1]))
         if name in _REBUILD or (name.split(".")[0] in _GROUPS and name in self._values):
