@@ -150,11 +150,13 @@ def diagnose(prepared: Prepared, sources: Mapping[str, str], *, jobs: int = 1, p
     """Search the catalogue; see the module docstrings of search, chance and problem for the method."""
     search = Search(prepared.problem, prepared.model, prepared.nuisances, sources, jobs=jobs, progress=progress)
     null = search.null()
-    limits = chance(prepared.problem, null.fit, search.signatures(null))
-    best, ranking, adequate = _choose(search, null, limits, max_effects)
+    limits = chance(search.problem, null.fit, search.signatures(null))
+    choice = _choose(search, null, limits, max_effects)
+    search, best, limits, adequate, ranking = choice.search, choice.best, choice.limits, choice.adequate, choice.ranking
+    prepared = replace(prepared, problem=search.problem)
     nothing = not best.names and adequate
     verdict = "nothing" if nothing else "effects" if adequate else "unknown"
-    tied = _ties(search, best, limits) if verdict == "effects" else ()
+    tied = _ties(choice) if verdict == "effects" else ()
     model = fitted_model(prepared.model, search, best) if best.names else prepared.model
     falls = error_falls(prepared, search, best, progress)
     effects = found_effects(search, best, limits, falls)
@@ -170,32 +172,54 @@ def diagnose(prepared: Prepared, sources: Mapping[str, str], *, jobs: int = 1, p
         values=best.fit.values)
 
 
-def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int
-            ) -> tuple[Candidate, tuple[Rank, ...], bool]:
-    """Smallest adequate set, the ranking of the first round, and whether it is adequate.
+@dataclass(frozen=True)
+class _Choice:
+    """The set that was chosen, the search (with its noise) in which it was judged, and its rivals of the same size."""
+
+    search: Search
+    best: Candidate
+    limits: Chance
+    adequate: bool
+    ranking: tuple[Rank, ...]
+    rivals: tuple[Candidate, ...] = ()
+
+
+def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -> _Choice:
+    """Smallest adequate set of effects.
 
     Sets of one, two and three effects in turn; each round extends the best of the round before by every effect, so that
-    two effects of which neither is best alone are found too.
+    two effects of which neither is best alone are found too.  After each round noise, scatter and critical values are
+    estimated afresh at the best point: those of a wrong model are wrong.
     """
-    best, front = null, [null]
-    ranking: tuple[Rank, ...] = ()
+    choice = _Choice(search, null, limits, null.fit.cost <= ADEQUATE * limits.misfit, ())
+    front = [null]
     texts = ("one effect", "two effects", "three effects")
     for size in range(1, max_effects + 1):
-        adequate = best.fit.cost <= limits.misfit
-        if adequate and size > 1:
+        enough = choice.best.fit.cost <= choice.limits.misfit
+        if enough and size > 1:
             break
-        round_ = search.extend(front, list(search.sources), texts[size - 1])
+        round_ = choice.search.extend(front, list(search.sources), texts[size - 1])
         if not round_:
             break
-        if size == 1:
-            ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in round_)
-        gain = best.penalised - round_[0].penalised
-        needed = limits.gain if adequate else max(limits.gain, WORTHWHILE * best.fit.cost)
+        ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in round_)
+        gain = choice.best.penalised - round_[0].penalised
+        needed = choice.limits.gain if enough else max(choice.limits.gain, WORTHWHILE * choice.best.fit.cost)
         if gain < needed:
+            choice = replace(choice, ranking=ranking)
             break
-        best = round_[0]
-        front = round_[:WIDE[min(size - 1, len(WIDE) - 1)]]
-    return best, ranking, best.fit.cost <= ADEQUATE * limits.misfit
+        new = choice.search.renewed(round_[0])
+        front = [new.refit(c) for c in round_[:WIDE[min(size - 1, len(WIDE) - 1)]]]
+        front.sort(key=lambda c: c.penalised)
+        best = new.polish(front[0])
+        limits_new = chance(new.problem, best.fit, new.signatures(best))
+        close = tuple(c for c in front[1:] if c.penalised <= best.penalised + _tie_margin(limits_new))
+        choice = _Choice(new, best, limits_new, best.fit.cost <= ADEQUATE * limits_new.misfit, ranking, close)
+        front = [best, *front[1:]]
+    return choice
+
+
+def _tie_margin(limits: Chance) -> float:
+    return max(limits.gain, 10.0)
 
 
 def _share(null: Candidate, candidate: Candidate, limits: Chance) -> float:
@@ -204,11 +228,9 @@ def _share(null: Candidate, candidate: Candidate, limits: Chance) -> float:
     return float(np.clip((null.fit.cost - candidate.fit.cost) / excess, 0.0, 1.0)) if excess > 0 else 0.0
 
 
-def _ties(search: Search, best: Candidate, limits: Chance) -> tuple[tuple[str, ...], ...]:
-    """Sets of the same size that fit as well as the best within what chance can gain; the best comes first."""
-    close = [c for c in search.found.values()
-             if len(c.names) == len(best.names) and c.penalised <= best.penalised + max(limits.gain, 10.0)]
-    return tuple(c.names for c in sorted(close, key=lambda c: c.penalised))
+def _ties(choice: _Choice) -> tuple[tuple[str, ...], ...]:
+    """Sets of the same size that fit as well as the best, within what chance can gain; the best comes first."""
+    return (choice.best.names, *(c.names for c in sorted(choice.rivals, key=lambda c: c.penalised)))
 
 
 def fitted_model(model: Model, search: Search, best: Candidate) -> Model:

@@ -14,7 +14,7 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from .fit import Fit, finite_differences, fit
-from .problem import Coordinate, Problem, effect_coordinates, nuisance_coordinate, vanishing_entry
+from .problem import Coordinate, Problem, build_problem, effect_coordinates, nuisance_coordinate, vanishing_entry
 from .rig import Nuisance
 
 Array = NDArray[np.float64]
@@ -176,6 +176,21 @@ class Search:
             candidate = Candidate(candidate.names, new, candidate.penalised - old.cost + new.cost)
             self.found[tuple(sorted(candidate.names))] = candidate
         return candidate
+
+    def renewed(self, best: Candidate) -> Search:
+        """The same search with noise and scatter estimated at another point: sensitivities there are the true ones."""
+        problem = build_problem(self.problem.rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values)
+        problem.simulations, problem.failures = self.problem.simulations, self.problem.failures
+        return Search(problem, self.model, self.nuisances, self.sources, self.jobs, self.progress, self.rows)
+
+    def refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
+        """A candidate of another problem (other noise), fitted in this one from its point."""
+        old = candidate.fit
+        new = fit(self.problem, old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
+        free = sum(1 for c in new.coordinates if not c.prior)
+        out = Candidate(candidate.names, new, new.cost + PENALTY * free)
+        self.found[tuple(sorted(out.names))] = out
+        return out
 
     # -- rounds -------------------------------------------------------------------------------------------------
     def extend(self, bases: Sequence[Candidate], names: Sequence[str], text: str) -> list[Candidate]:
