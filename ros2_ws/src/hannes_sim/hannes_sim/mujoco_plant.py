@@ -350,6 +350,7 @@ class MujocoPlant:
             at = joint.qposadr[0]
             m.qpos_spring[at] = given["springref"][at] * (preload / rate)
         self._table[_T_FRICTION:_T_DAMPING] = given["friction"] * friction
+        m.dof_frictionloss[self._counts[_C_JOINTS:]] = self._table[_T_FRICTION:_T_DAMPING]
         if self.variant.transmission == "wires":
             for name in CARTS:
                 dof = m.joint(name).dofadr[0]
