@@ -27,8 +27,9 @@ ROSDEP_KEYS = {
     "scikit-learn": "python3-sklearn",
     "scipy": "python3-scipy",
     "typer": "python3-typer",
-    # rosdep has no keys for these; they come from setup.cfg by pip only
+    # no rosdep key known, or a part of another package; by pip only
     "llvmlite": None,
+    "markupsafe": None,
     "lz4": None,
     "mcap": None,
     "onnx": None,

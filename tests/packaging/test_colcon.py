@@ -37,7 +37,7 @@ def colcon(*words: str, **options: object) -> subprocess.CompletedProcess[str]:
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A workspace with a copy of our sources, built and installed."""
     root = tmp_path_factory.mktemp("ws")
-    ignore = shutil.ignore_patterns("__pycache__", "*.egg-info")
+    ignore = shutil.ignore_patterns("__pycache__", "*.egg-info", "build")
     shutil.copytree(SOURCES, root / "src", ignore=ignore)
     answer = colcon("build", cwd=root)
     assert answer.returncode == 0, answer.stdout + answer.stderr
