@@ -1,0 +1,433 @@
+"""One self-contained page of a comparison and a diagnosis: for people who want to look before they believe.
+
+The page is made of the same dictionaries that `--json` prints, carries them inside for others to read, and loads nothing:
+script, styles and data are in the file, and its content security policy forbids every request.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import math
+import platform
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from hannes_description.errors import HannesError
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from . import report_text as text
+from .report_svg import curve_svg, overlay_svg, tick_text
+
+Part = Mapping[str, Any]
+
+HERE = Path(__file__).parent
+
+PHASES = ("void", "grasp", "hold", "opening", "rest")
+
+HOT = 30.0
+"""Multiple of the repeatability at which the failure map's colour is full; 1 is where it begins."""
+
+DECADES = 8.0
+"""Ratio of largest to smallest error from which the error's fall is shown on a logarithmic scale."""
+
+RANKS = 8
+"""Rows of the ranking that are open at first."""
+
+PACKAGES = ("hannes_lab", "hannes_sim", "mujoco", "numba", "numpy", "scipy")
+
+VARIABLE_UNITS = {"position": "rad", "velocity": "rad/s"}
+"""Unit of each variable; `load` has that of the signal, the others have none."""
+
+
+def write_report(path: str | Path, *, comparison: Part | None, after: Part | None = None, diagnosis: Part | None = None,
+                 title: str = "Model against closures", command: str = "", created: str = "") -> Path:
+    """Write the page and return its path.
+
+    comparison  Comparison.to_dict() of the model as it was
+    after       Comparison.to_dict() of the model with the effects added
+    diagnosis   Diagnosis.to_dict()
+    command     what to run to get this page again; created: date and time as they are to be shown
+    Raises HannesError if there is nothing to report or the file cannot be written.
+    """
+    page = render_report(comparison=comparison, after=after, diagnosis=diagnosis, title=title, command=command,
+                         created=created)
+    out = Path(path)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise HannesError(f"The report cannot be written to '{out}': {error.strerror or error}.") from error
+    return out
+
+
+def render_report(*, comparison: Part | None, after: Part | None = None, diagnosis: Part | None = None,
+                  title: str = "Model against closures", command: str = "", created: str = "") -> str:
+    """The page as a text; see write_report."""
+    if comparison is None:
+        comparison, after = after, None
+    if comparison is None and diagnosis is None:
+        raise HannesError("There is nothing to report: neither a comparison nor a diagnosis was given.")
+    scripts = {"uplot": _asset("uPlot.iife.min.js"), "page": _asset("report.js")}
+    data = {"title": title, "command": command, "created": created, "versions": versions(),
+            "comparison": comparison, "after": after, "diagnosis": diagnosis}
+    before_name, after_name = _model_names(comparison, after, diagnosis)
+    environment = Environment(loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined,
+                              trim_blocks=True, lstrip_blocks=True)
+    environment.filters.update(number=text.number, ratio=text.ratio, percent=text.percent, words=text.words,
+                               unit=text.unit, signed_percent=text.signed_percent, plus_minus=text.plus_minus,
+                               fixed=lambda v, n=2: text.DASH if text.known(v) is None else text.fixed(v, n))
+    sources = [part for part in (diagnosis, comparison) if part is not None]
+    context = {
+        "title": title, "command": command, "created": created, "versions": data["versions"],
+        "before_name": before_name, "after_name": after_name, "both": after is not None,
+        "verdict": verdict_of(comparison, after, diagnosis), "fall": error_fall(diagnosis),
+        "conditions": overlay_groups(comparison, after), "maps": failure_maps(comparison, after),
+        "dependences": dependences(comparison, after, diagnosis), "effects": effects(diagnosis),
+        "tied": tied(diagnosis), "experiments": _list(diagnosis, "experiments"), "ranking": ranking(diagnosis),
+        "metrics": metric_groups(comparison, after), "nuisances": nuisances(diagnosis),
+        "data": _list(sources[0], "data") or _list(sources[-1], "data"),
+        "notes": list(dict.fromkeys(str(n) for part in (*sources, after) for n in _list(part, "notes"))),
+        "models": _models(comparison, after, diagnosis),
+        "json": Markup(embedded_json(data)), "scripts": {name: Markup(body) for name, body in scripts.items()},
+        "styles": Markup(_asset("uPlot.min.css") + _asset("report.css")),
+        "policy": content_policy(scripts.values()), "uplot_licence": _asset("uPlot.LICENSE"),
+    }
+    return environment.get_template("report.html.j2").render(context)
+
+
+def embedded_json(data: Any) -> str:
+    """JSON that may stand inside a script element: no NaN (null instead), nothing that could end the element."""
+    body = json.dumps(_finite(data), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for sign in "<>&\u2028\u2029":
+        body = body.replace(sign, f"\\u{ord(sign):04x}")
+    return body
+
+
+def content_policy(scripts: Iterable[str]) -> str:
+    """Nothing may be requested, and no script but these may run, whatever the data hold."""
+    hashes = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'" for s in scripts)
+    return f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+
+
+def versions() -> dict[str, str]:
+    """What made the page."""
+    out = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            out[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return out
+
+
+def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> dict[str, Any]:
+    """Kind (the colour), one plain sentence, the reason, and the figures that matter."""
+    kind = str(diagnosis.get("verdict", "")) if diagnosis is not None else "comparison"
+    names = [str(e.get("title") or text.words(e.get("name", ""))) for e in _list(diagnosis, "effects")]
+    overall = text.known((comparison or {}).get("overall"))
+    if kind == "nothing":
+        headline = "Nothing is missing from the model."
+    elif kind == "effects":
+        headline = f"The model lacks {' + '.join(names)}." if names else "The model lacks an effect."
+        others = [" + ".join(text.words(n) for n in group) for group in _list(diagnosis, "tied")[1:]]
+        if others:
+            headline = f"{headline[:-1]}, or {text.listed(others, 'or')}: these data cannot tell."
+    elif kind == "unknown":
+        headline = "Something is missing that the catalogue does not hold."
+    elif kind != "comparison":
+        headline, kind = f"Verdict: {kind or 'none was given'}.", "other"
+    elif overall is None:
+        headline = "The model beside the measurement; without repeated closures there is no scale to judge it by."
+    else:
+        headline = (f"The model misses the closures by {text.ratio(overall)} times what they differ among themselves."
+                    if overall > 1.2 else
+                    f"The model follows the closures to {text.ratio(overall)} times what they differ among themselves.")
+    label = {"nothing": "Complete", "effects": "Effect found", "unknown": "Unknown effect",
+             "comparison": "Comparison"}.get(kind, "Verdict")
+    return {"kind": kind if kind in ("nothing", "effects", "unknown") else "other", "label": label,
+            "headline": headline, "summary": str(diagnosis.get("summary", "")) if diagnosis is not None else "",
+            "figures": _figures(comparison, after, diagnosis)}
+
+
+def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> list[dict[str, str]]:
+    out = []
+    falls = _list(diagnosis, "falls")
+    if len(falls) > 1:
+        first = falls[1] if len(falls) > 2 else falls[0]
+        out.append({"value": text.ratio(falls[-1].get("held_out")), "was": text.ratio(first.get("held_out")),
+                    "label": f"held-out error, in multiples of the repeatability; before: {first.get('added', '')}"})
+    elif comparison is not None:
+        now = after if after is not None else comparison
+        out.append({"value": text.ratio(now.get("overall")),
+                    "was": text.ratio(comparison.get("overall")) if after is not None else "",
+                    "label": "error in multiples of the repeatability"})
+    cells = _list(comparison, "cells")
+    judged = [c for c in cells if text.known(c.get("p_value")) is not None]
+    if judged:
+        now_cells = _list(after, "cells") or cells
+        out.append({"value": f"{sum(bool(c.get('fails')) for c in now_cells)} of {len(now_cells)}",
+                    "was": str(sum(bool(c.get("fails")) for c in cells)) if after is not None else "",
+                    "label": "signals × phases beyond chance (5 % false discoveries)"})
+    data = _list(diagnosis, "data") or _list(comparison, "data")
+    closures = [text.known(d.get("closures")) for d in data]
+    if data and all(n is not None for n in closures):
+        conditions = {str(c) for d in data for c in d.get("conditions", [])}
+        total = sum(int(n) for n in closures if n is not None)
+        out.append({"value": str(total), "was": "",
+                    "label": f"{'closure' if total == 1 else 'closures'} of {len(conditions)} "
+                             f"{'condition' if len(conditions) == 1 else 'conditions'}"})
+    simulations = text.known((diagnosis or {}).get("simulations"))
+    if simulations is not None:
+        out.append({"value": f"{simulations:,.0f}".replace(",", "\u202f"), "was": "", "label": "simulations run to find out"})
+    return out
+
+
+def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:
+    """Bars of the error, step by step, on one scale: places in percent of the track."""
+    falls = _list(diagnosis, "falls")
+    if not falls:
+        return None
+    conditions = list(dict.fromkeys(str(c) for f in falls for c in f.get("by_condition", {})))
+    values = [v for f in falls for v in map(text.known, (f.get("train"), f.get("held_out"),
+                                                          *f.get("by_condition", {}).values())) if v and v > 0.0]
+    low, high = min([1.0, *values]), max([1.0, *values])
+    log = high / low >= DECADES
+    start, stop = (low / 1.5, high * 1.15) if log else (0.0, high * 1.08)
+
+    def place(value: Any) -> float | None:
+        v = text.known(value)
+        if v is None or v <= 0.0:
+            return None
+        part = math.log(v / start) / math.log(stop / start) if log else (v - start) / (stop - start)
+        return round(100.0 * min(1.0, max(0.0, part)), 2)
+
+    rows = []
+    for k, fall in enumerate(falls):
+        added = str(fall.get("added", ""))
+        by_condition = fall.get("by_condition", {})
+        rows.append({"label": added if k < 2 else f"+ {text.words(added)}", "kind": "before" if k < 2 else "after",
+                     "train": fall.get("train"), "held_out": fall.get("held_out"),
+                     "train_at": place(fall.get("train")), "held_out_at": place(fall.get("held_out")),
+                     "fitted": k > 0,
+                     "dots": [{"condition": c, "value": by_condition.get(c), "at": place(by_condition.get(c))}
+                              for c in conditions]})
+    signals = list(dict.fromkeys((str(s.get("condition")), str(s.get("signal")), str(s.get("unit", "")))
+                                 for f in falls for s in f.get("signals", [])))
+    table = [{"condition": c, "signal": s, "unit": u,
+              "steps": [next((e for e in f.get("signals", []) if (e.get("condition"), e.get("signal")) == (c, s)), {})
+                        for f in falls]} for c, s, u in signals]
+    marks = text.log_ticks(start, stop) if log else text.ticks(start, stop)
+    return {"rows": rows, "log": log, "floor": place(1.0), "conditions": conditions, "table": table,
+            "ticks": [{"at": place(v) or 0.0, "label": tick_text(v)} for v in marks]}
+
+
+def overlay_groups(comparison: Part | None, after: Part | None) -> list[dict[str, Any]]:
+    """Overlays by condition, each beside its counterpart of the model after."""
+    overlays = _list(comparison, "overlays")
+    later = _occurrences(_list(after, "overlays"))
+    errors, errors_later = _occurrences(_list(comparison, "errors")), _occurrences(_list(after, "errors"))
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for key, k in _occurrences(overlays).items():
+        overlay, j = overlays[k], later.get(key)
+        before = _list(comparison, "errors")[errors[key]] if key in errors else {}
+        now = _list(after, "errors")[errors_later[key]] if key in errors_later else None
+        groups.setdefault(key[0], []).append({
+            "index": k, "after": j, "signal": key[1], "unit": str(overlay.get("unit", "")), "before_error": before,
+            "after_error": now, "svg": overlay_svg(overlay, _list(after, "overlays")[j] if j is not None else None)})
+    return [{"condition": name, "panels": panels} for name, panels in groups.items()]
+
+
+def failure_maps(comparison: Part | None, after: Part | None) -> list[dict[str, Any]]:
+    """Condition x signal x phase, of the model before and after; columns are the phases that occur."""
+    cells = _list(comparison, "cells")
+    names = list(dict.fromkeys(str(c.get("phase", "")) for c in cells))
+    phases = [p for p in PHASES if p in names] + [p for p in names if p not in PHASES]
+    out = []
+    for kind, source in (("before", cells), ("after", _list(after, "cells"))):
+        if not source:
+            continue
+        by = {(str(c.get("condition")), str(c.get("signal")), str(c.get("phase"))): c for c in source}
+        groups: dict[str, dict[str, list[Any]]] = {}
+        for condition, signal, _ in by:
+            groups.setdefault(condition, {})[signal] = [
+                {**by[condition, signal, p], "heat": heat(by[condition, signal, p].get("ratio"))}
+                if (condition, signal, p) in by else None for p in phases]
+        out.append({"kind": kind, "phases": phases, "groups": groups, "cells": source,
+                    "fails": sum(bool(c.get("fails")) for c in source), "all": len(source),
+                    "judged": any(text.known(c.get("p_value")) is not None for c in source)})
+    return out
+
+
+def heat(value: Any) -> float | None:
+    """0..1 on a logarithmic scale from the repeatability to HOT times it."""
+    v = text.known(value)
+    if v is None:
+        return None
+    return round(min(1.0, max(0.0, math.log(v) / math.log(HOT))), 3) if v > 0.0 else 0.0
+
+
+def dependences(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> dict[str, Any] | None:
+    """What the residual depends on: curves of the model before and after on common axes."""
+    found = bool(_list(diagnosis, "effects"))
+    before = (comparison or (diagnosis if not found else None) or {}).get("depends_on") or {}
+    later = ((diagnosis if found else after) or {}).get("depends_on") or {}
+    rows = []
+    for name in dict.fromkeys([*before, *later]):
+        sources = [(kind, s[name]) for kind, s in (("before", before), ("after", later)) if name in s]
+        curves = [(kind, [text.known(v) for v in d.get("centres", [])], [text.known(v) for v in d.get("curve", [])])
+                  for kind, d in sources]
+        signal = str(sources[0][1].get("signal", ""))
+        signal_unit = _unit_of(signal, comparison, after)
+        xs = [v for _, x, _ in curves for v in x if v is not None]
+        ys = [v for _, _, y in curves for v in y if v is not None]
+        steps = name == "direction"
+        unit = signal_unit if name == "load" else VARIABLE_UNITS.get(name, "")
+        rows.append({
+            "name": name, "signal": signal, "unit": signal_unit, "variable_unit": unit,
+            "shares": {kind: d.get("share") for kind, d in sources},
+            "svg": curve_svg(curves, steps=steps) if len(xs) > 1 else None,
+            "ends": _ends(name, xs, unit), "top": max([0.0, *ys]), "bottom": min([0.0, *ys])})
+    if not rows:
+        return None
+    key = "after" if later else "before"
+    rows.sort(key=lambda r: -(text.known(r["shares"].get(key)) or 0.0))
+    strongest = [r for r in rows if (text.known(r["shares"].get(key)) or 0.0) >= 0.05][:3]
+    return {"rows": rows, "signal": rows[0]["signal"], "kinds": [k for k, s in (("before", before), ("after", later)) if s],
+            "strongest": [(r["name"], r["shares"][key]) for r in strongest]}
+
+
+def _ends(name: str, xs: Sequence[float], unit: str) -> list[str]:
+    """What to write below a curve: its ends, or the groups' names."""
+    if name == "direction":
+        return ["opening", "standing", "closing"]
+    if name == "time":
+        return ["first closure", "last"]
+    if not xs:
+        return []
+    return [text.number(min(xs), 2), f"{text.number(max(xs), 2)} {text.unit(unit)}".strip()]
+
+
+def effects(diagnosis: Part | None) -> list[dict[str, Any]]:
+    """The effects of the verdict, parameters with intervals on a power of ten that suits them."""
+    out = []
+    for effect in _list(diagnosis, "effects"):
+        parameters = [{"name": name, "identified": p.get("identified", True),
+                       **text.interval(p.get("value"), p.get("low"), p.get("high"), p.get("unit", ""))}
+                      for name, p in effect.get("parameters", {}).items()]
+        out.append({"name": str(effect.get("name", "")), "title": effect.get("title") or text.words(effect.get("name", "")),
+                    "source": effect.get("source"), "why": effect.get("why", ""), "parameters": parameters})
+    return out
+
+
+def tied(diagnosis: Part | None) -> list[str]:
+    """Sets of effects that fit equally well; empty if there is one only."""
+    groups = [" + ".join(text.words(n) for n in names) for names in _list(diagnosis, "tied")]
+    return groups if len(groups) > 1 else []
+
+
+def ranking(diagnosis: Part | None) -> dict[str, Any] | None:
+    """Every effect alone: the share of the excess misfit that it explains, and what is left in multiples of chance."""
+    rows = _list(diagnosis, "ranking")
+    if diagnosis is None or not rows:
+        return None
+    critical = text.known((diagnosis.get("costs") or {}).get("critical"))
+    found = {str(e.get("name")) for e in _list(diagnosis, "effects")}
+    out = []
+    for row in rows:
+        cost, share = text.known(row.get("cost")), text.known(row.get("explained"))
+        out.append({"label": " + ".join(text.words(n) for n in row.get("names", [])), "cost": cost, "explained": share,
+                    "of_chance": cost / critical if cost is not None and critical else None,
+                    "width": round(100.0 * min(1.0, max(0.0, share or 0.0)), 2),
+                    "found": set(row.get("names", [])) <= found and bool(found)})
+    return {"first": out[:RANKS], "rest": out[RANKS:], "critical": critical, "draws": (diagnosis.get("chance") or {}).get("draws"),
+            "nominal": (diagnosis.get("costs") or {}).get("nominal_fitted"),
+            "final": (diagnosis.get("costs") or {}).get("final"),
+            "excess": any(r["explained"] for r in out)}
+
+
+def metric_groups(comparison: Part | None, after: Part | None) -> list[dict[str, Any]]:
+    """The thesis' figures by condition, measured beside the model before and after."""
+    later = {(m.get("condition"), m.get("name")): m for m in _list(after, "metrics")}
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for row in _list(comparison, "metrics"):
+        groups.setdefault(str(row.get("condition", "")), []).append(
+            {"before": row, "after": later.get((row.get("condition"), row.get("name")))})
+    return [{"condition": name, "rows": rows} for name, rows in groups.items()]
+
+
+def nuisances(diagnosis: Part | None) -> dict[str, Any] | None:
+    """How far the fit moved the nominal parameters, in standard deviations of their priors; farthest first."""
+    table = (diagnosis or {}).get("nuisances") or {}
+    rows = []
+    for name, row in table.items():
+        z = text.known(row.get("prior_sds"))
+        rows.append({"name": name, "z": z, **{k: row.get(k) for k in ("value", "nominal", "low", "high")},
+                     "unit": str(row.get("unit", ""))})
+    if not rows:
+        return None
+    rows.sort(key=lambda r: -abs(r["z"] or 0.0))
+    span = max(4.0, *(math.ceil(abs(r["z"] or 0.0)) for r in rows))
+    for row in rows:
+        row["at"] = None if row["z"] is None else round(50.0 + 50.0 * row["z"] / span, 2)
+        row["far"] = row["z"] is not None and abs(row["z"]) > 2.0
+    step = max(1, math.ceil(span / 4.0)) if span > 4.0 else 2
+    marks = [k for k in range(-int(span), int(span) + 1) if k % step == 0]
+    return {"rows": rows, "usual": [50.0 - 100.0 / span, 200.0 / span],
+            "ticks": [{"at": 50.0 + 50.0 * k / span, "label": text.minus(f"{k:+d}" if k else "0")} for k in marks]}
+
+
+def _model_names(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> tuple[str, str]:
+    if comparison is None:
+        return "", ""
+    state = "own parameters fitted" if comparison.get("fitted") else "as given"
+    added = [str(e.get("title") or text.words(e.get("name", ""))) for e in _list(diagnosis, "effects")]
+    return state, f"with {' + '.join(added)}" if added else "refitted" if after is not None else ""
+
+
+def _models(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> list[dict[str, str]]:
+    rows = [("compared", comparison), ("compared, after", after), ("of the diagnosis", diagnosis)]
+    out = [{"role": role, "name": str((part.get("model") or {}).get("name", "")),
+            "sha256": str((part.get("model") or {}).get("sha256", ""))} for role, part in rows if part is not None]
+    return [m for m in out if m["name"] or m["sha256"]]
+
+
+def _unit_of(signal: str, *parts: Part | None) -> str:
+    rows = (row for part in parts for row in _list(part, "errors"))
+    return next((str(row.get("unit", "")) for row in rows if row.get("signal") == signal), "")
+
+
+def _occurrences(rows: Sequence[Part]) -> dict[tuple[str, str, int], int]:
+    """Place of every row by condition, signal and which of those (two recordings may share a condition's name)."""
+    seen: Counter[tuple[str, str]] = Counter()
+    out = {}
+    for k, row in enumerate(rows):
+        key = (str(row.get("condition", "")), str(row.get("signal", "")))
+        out[*key, seen[key]] = k
+        seen[key] += 1
+    return out
+
+
+def _list(part: Part | None, key: str) -> list[Any]:
+    value = (part or {}).get(key)
+    return list(value) if isinstance(value, list | tuple) else []
+
+
+def _finite(data: Any) -> Any:
+    """The same data with None for what JSON cannot say."""
+    if isinstance(data, Mapping):
+        return {str(k): _finite(v) for k, v in data.items()}
+    if isinstance(data, list | tuple):
+        return [_finite(v) for v in data]
+    if isinstance(data, float) and not math.isfinite(data):
+        return None
+    return data
+
+
+def _asset(name: str) -> str:
+    return (HERE / "static" / name).read_text(encoding="utf-8")
