@@ -19,15 +19,20 @@ NODES = {
     "emg_reference": "hannes_control.emg_reference_node:EmgReferenceNode",
     "motor_controller": "hannes_control.motor_controller_node:MotorController",
     "hand_sim": "hannes_sim.sim_node:HandSim",
+    "stiffness_classifier": "hannes_stiffness.stiffness_node:StiffnessNode",
+    "recorder": "hannes_bags.recorder_node:RecorderNode",
 }
 """Class of each node that can be composed."""
 
+DEFAULT = ("emg_source", "emg_reference", "motor_controller", "stiffness_classifier", "hand_sim")
+"""The nodes that are started unless told otherwise; what comes last finds the others' subscriptions in place."""
+
 
 def chosen(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Names of the nodes to start (`--nodes a,b,c`; all by default) and the other arguments."""
+    """Names of the nodes to start (`--nodes a,b,c`; DEFAULT without it) and the other arguments."""
     arguments = list(argv)
     if "--nodes" not in arguments:
-        return list(NODES), arguments
+        return list(DEFAULT), arguments
     at = arguments.index("--nodes")
     if at + 1 >= len(arguments):
         raise HannesError(f"--nodes needs a list with commas of {', '.join(NODES)}.")
