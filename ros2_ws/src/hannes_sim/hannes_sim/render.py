@@ -1,24 +1,26 @@
 """Pictures of the hand: offscreen, no window and no display needed.
 
-MuJoCo draws with EGL where MUJOCO_GL is not set; `osmesa` or `glfw` in that variable choose another way.
+On Linux the OpenGL context is EGL's, unless MUJOCO_GL names another way (`osmesa`, `glfw`).  MuJoCo itself reads that
+variable when it is imported, so the context is made here, whoever imported MuJoCo first.
 """
 
 from __future__ import annotations
 
 import os
+import struct
+import sys
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
-
-os.environ.setdefault("MUJOCO_GL", "egl")
+from typing import Any
 
 import mujoco
+import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.joints import JOINT_LIMITS, JOINT_NAMES
 from hannes_description.mjcf import Variant, build_spec
 from hannes_description.parameters import ParameterSet
+from numpy.typing import NDArray
 
 from .objects import GraspObject
 
@@ -37,6 +39,18 @@ VIEWS: Mapping[str, tuple[float, float, float, tuple[float, float, float]]] = {
     "thumb": (230.0, -16.0, 0.30, (0.022, 0.004, 0.074)),
 }
 """Cameras by name: azimuth and elevation in degrees, distance in m, the point looked at in m."""
+
+
+def _context(width: int, height: int) -> Any:
+    """An offscreen OpenGL context of the chosen kind."""
+    kind = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if kind == "osmesa":
+        from mujoco.osmesa import GLContext
+    elif kind in ("", "egl") and sys.platform.startswith("linux"):
+        from mujoco.egl import GLContext
+    else:
+        from mujoco.gl_context import GLContext
+    return GLContext(width, height)
 
 
 class HandRenderer:
@@ -67,11 +81,19 @@ class HandRenderer:
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self._addresses = [int(self.model.joint(name).qposadr[0]) for name in JOINT_NAMES]
+        self._context: Any = None
+        self._canvas: Any = None
         try:
-            self._renderer = mujoco.Renderer(self.model, height, width)
+            self._context = _context(width, height)
+            self._context.make_current()
+            self._canvas = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except Exception as error:  # the OpenGL back ends raise types of their own
+            self.close()
             raise HannesError(f"No offscreen OpenGL for pictures ({type(error).__name__}: {error}); install libegl1 or "
                               "set MUJOCO_GL=osmesa.") from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._canvas)
+        self._scene = mujoco.MjvScene(self.model, maxgeom=500)
+        self._size = mujoco.MjrRect(0, 0, width, height)
         self._options = mujoco.MjvOption()
         self._options.flags[mujoco.mjtVisFlag.mjVIS_TENDON] = False
         self._options.sitegroup[:] = 0
@@ -92,12 +114,22 @@ class HandRenderer:
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.azimuth, camera.elevation, camera.distance = azimuth, elevation, distance
         camera.lookat[:] = lookat
-        self._renderer.update_scene(self.data, camera, self._options)
-        return np.asarray(self._renderer.render(), dtype=np.uint8).copy()
+        image = np.empty((self._size.height, self._size.width, 3), dtype=np.uint8)
+        self._context.make_current()  # another renderer may have drawn since
+        mujoco.mjv_updateScene(self.model, self.data, self._options, None, camera,
+                               mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)
+        mujoco.mjr_render(self._size, self._scene, self._canvas)
+        mujoco.mjr_readPixels(image, None, self._size, self._canvas)
+        return np.flipud(image).copy()
 
     def close(self) -> None:
         """Free the OpenGL context."""
-        self._renderer.close()
+        if self._context is not None:
+            self._context.make_current()
+            if self._canvas is not None:
+                self._canvas.free()
+            self._context.free()
+            self._context = None
 
     def __enter__(self) -> HandRenderer:
         return self
@@ -113,9 +145,6 @@ def side_by_side(images: list[Image]) -> Image:
 
 def save_png(image: Image, path: str | Path) -> Path:
     """Write an image (height, width, 3) of uint8 as PNG, with the standard library alone."""
-    import struct
-    import zlib
-
     image = np.ascontiguousarray(image, dtype=np.uint8)
     if image.ndim != 3 or image.shape[2] != 3:
         raise HannesError(f"A picture must have the shape (height, width, 3), not {image.shape}.")
