@@ -1,7 +1,7 @@
 """One self-contained page of a comparison and a diagnosis: for people who want to look before they believe.
 
-The page is made of the same dictionaries that `--json` prints, carries them inside for others to read, and loads nothing:
-script, styles and data are in the file, and its content security policy forbids every request.
+The page is made of the same dictionaries that `--json` prints, carries them inside for others to read, and loads
+nothing: script, styles and data are in the file, and its content security policy forbids every request.
 """
 
 from __future__ import annotations
@@ -35,6 +35,9 @@ HOT = 30.0
 
 DECADES = 8.0
 """Ratio of largest to smallest error from which the error's fall is shown on a logarithmic scale."""
+
+VISIBLE = 3.0
+"""Whitened distance from which two models can be told apart by an experiment."""
 
 RANKS = 8
 """Rows of the ranking that are open at first."""
@@ -89,7 +92,10 @@ def render_report(*, comparison: Part | None, after: Part | None = None, diagnos
         "verdict": verdict_of(comparison, after, diagnosis), "fall": error_fall(diagnosis),
         "conditions": overlay_groups(comparison, after), "maps": failure_maps(comparison, after),
         "dependences": dependences(comparison, after, diagnosis), "effects": effects(diagnosis),
-        "tied": tied(diagnosis), "experiments": _list(diagnosis, "experiments"), "ranking": ranking(diagnosis),
+        "tied": tied(diagnosis), "experiments": _list(diagnosis, "experiments"),
+        "separable": any((text.known(x.get("distance")) or 0.0) >= VISIBLE
+                         for x in _list(diagnosis, "experiments")),
+        "ranking": ranking(diagnosis),
         "metrics": metric_groups(comparison, after), "nuisances": nuisances(diagnosis),
         "data": _list(sources[0], "data") or _list(sources[-1], "data"),
         "notes": list(dict.fromkeys(str(n) for part in (*sources, after) for n in _list(part, "notes"))),
@@ -134,10 +140,7 @@ def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | No
     if kind == "nothing":
         headline = "Nothing is missing from the model."
     elif kind == "effects":
-        headline = f"The model lacks {' + '.join(names)}." if names else "The model lacks an effect."
-        others = [" + ".join(text.words(n) for n in group) for group in _list(diagnosis, "tied")[1:]]
-        if others:
-            headline = f"{headline[:-1]}, or {text.listed(others, 'or')}: these data cannot tell."
+        headline = lacking(diagnosis, names)
     elif kind == "unknown":
         headline = "Something is missing that the catalogue does not hold."
     elif kind != "comparison":
@@ -148,11 +151,28 @@ def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | No
         headline = (f"The model misses the closures by {text.ratio(overall)} times what they differ among themselves."
                     if overall > 1.2 else
                     f"The model follows the closures to {text.ratio(overall)} times what they differ among themselves.")
-    label = {"nothing": "Complete", "effects": "Effect found", "unknown": "Unknown effect",
-             "comparison": "Comparison"}.get(kind, "Verdict")
+    label = {"nothing": "Complete", "effects": "Effects found" if len(names) > 1 else "Effect found",
+             "unknown": "Unknown effect", "comparison": "Comparison"}.get(kind, "Verdict")
     return {"kind": kind if kind in ("nothing", "effects", "unknown") else "other", "label": label,
             "headline": headline, "summary": str(diagnosis.get("summary", "")) if diagnosis is not None else "",
             "figures": _figures(comparison, after, diagnosis)}
+
+
+def lacking(diagnosis: Part | None, titles: Sequence[str]) -> str:
+    """What is missing, in a sentence; of tied sets, what they share and what cannot be told apart."""
+    if not titles:
+        return "The model lacks an effect."
+    groups = [[str(n) for n in group] for group in _list(diagnosis, "tied")]
+    if len(groups) < 2:
+        return f"The model lacks {text.listed(titles)}."
+    named = {str(e.get("name")): title for e, title in zip(_list(diagnosis, "effects"), titles, strict=True)}
+    shared = [n for n in groups[0] if all(n in group for group in groups)]
+    options = [" with ".join(named.get(n, text.words(n)) for n in group if n not in shared) for group in groups]
+    either = text.listed([o for o in options if o], "or")
+    sure = text.listed([named.get(n, text.words(n)) for n in shared])
+    if sure:
+        return f"The model lacks {sure} and one of these: {either}. The data cannot tell which."
+    return f"The model lacks {either}: these data cannot tell which."
 
 
 def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> list[dict[str, str]]:
@@ -173,7 +193,7 @@ def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None
         now_cells = _list(after, "cells") or cells
         out.append({"value": f"{sum(bool(c.get('fails')) for c in now_cells)} of {len(now_cells)}",
                     "was": str(sum(bool(c.get("fails")) for c in cells)) if after is not None else "",
-                    "label": "signals × phases beyond chance (5 % false discoveries)"})
+                    "label": "signals × phases beyond chance (5\u00a0% false discoveries)"})
     data = _list(diagnosis, "data") or _list(comparison, "data")
     closures = [text.known(d.get("closures")) for d in data]
     if data and all(n is not None for n in closures):
@@ -184,7 +204,8 @@ def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None
                              f"{'condition' if len(conditions) == 1 else 'conditions'}"})
     simulations = text.known((diagnosis or {}).get("simulations"))
     if simulations is not None:
-        out.append({"value": f"{simulations:,.0f}".replace(",", "\u202f"), "was": "", "label": "simulations run to find out"})
+        out.append({"value": f"{simulations:,.0f}".replace(",", "\u202f"), "was": "",
+                    "label": "simulations run to find out"})
     return out
 
 
@@ -219,9 +240,11 @@ def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:
                               for c in conditions]})
     signals = list(dict.fromkeys((str(s.get("condition")), str(s.get("signal")), str(s.get("unit", "")))
                                  for f in falls for s in f.get("signals", [])))
-    table = [{"condition": c, "signal": s, "unit": u,
-              "steps": [next((e for e in f.get("signals", []) if (e.get("condition"), e.get("signal")) == (c, s)), {})
-                        for f in falls]} for c, s, u in signals]
+    table: list[dict[str, Any]] = []
+    for c, s, u in signals:
+        steps = [next((e for e in f.get("signals", []) if (e.get("condition"), e.get("signal")) == (c, s)), {})
+                 for f in falls]
+        table.append({"condition": c, "signal": s, "unit": u, "steps": steps})
     marks = text.log_ticks(start, stop) if log else text.ticks(start, stop)
     return {"rows": rows, "log": log, "floor": place(1.0), "conditions": conditions, "table": table,
             "ticks": [{"at": place(v) or 0.0, "label": tick_text(v)} for v in marks]}
@@ -298,7 +321,8 @@ def dependences(comparison: Part | None, after: Part | None, diagnosis: Part | N
     key = "after" if later else "before"
     rows.sort(key=lambda r: -(text.known(r["shares"].get(key)) or 0.0))
     strongest = [r for r in rows if (text.known(r["shares"].get(key)) or 0.0) >= 0.05][:3]
-    return {"rows": rows, "signal": rows[0]["signal"], "kinds": [k for k, s in (("before", before), ("after", later)) if s],
+    return {"rows": rows, "signal": rows[0]["signal"],
+            "kinds": [k for k, s in (("before", before), ("after", later)) if s],
             "strongest": [(r["name"], r["shares"][key]) for r in strongest]}
 
 
@@ -320,8 +344,10 @@ def effects(diagnosis: Part | None) -> list[dict[str, Any]]:
         parameters = [{"name": name, "identified": p.get("identified", True),
                        **text.interval(p.get("value"), p.get("low"), p.get("high"), p.get("unit", ""))}
                       for name, p in effect.get("parameters", {}).items()]
-        out.append({"name": str(effect.get("name", "")), "title": effect.get("title") or text.words(effect.get("name", "")),
-                    "source": effect.get("source"), "why": effect.get("why", ""), "parameters": parameters})
+        out.append({"name": str(effect.get("name", "")),
+                    "title": effect.get("title") or text.words(effect.get("name", "")),
+                    "source": effect.get("source"), "why": effect.get("why", ""),
+                    "parameters": parameters})
     return out
 
 
@@ -345,10 +371,8 @@ def ranking(diagnosis: Part | None) -> dict[str, Any] | None:
                     "of_chance": cost / critical if cost is not None and critical else None,
                     "width": round(100.0 * min(1.0, max(0.0, share or 0.0)), 2),
                     "found": set(row.get("names", [])) <= found and bool(found)})
-    return {"first": out[:RANKS], "rest": out[RANKS:], "critical": critical, "draws": (diagnosis.get("chance") or {}).get("draws"),
-            "nominal": (diagnosis.get("costs") or {}).get("nominal_fitted"),
-            "final": (diagnosis.get("costs") or {}).get("final"),
-            "excess": any(r["explained"] for r in out)}
+    return {"first": out[:RANKS], "rest": out[RANKS:], "critical": critical,
+            "draws": (diagnosis.get("chance") or {}).get("draws"), "excess": any(r["explained"] for r in out)}
 
 
 def metric_groups(comparison: Part | None, after: Part | None) -> list[dict[str, Any]]:
@@ -356,9 +380,18 @@ def metric_groups(comparison: Part | None, after: Part | None) -> list[dict[str,
     later = {(m.get("condition"), m.get("name")): m for m in _list(after, "metrics")}
     groups: dict[str, list[dict[str, Any]]] = {}
     for row in _list(comparison, "metrics"):
+        now = later.get((row.get("condition"), row.get("name")))
         groups.setdefault(str(row.get("condition", "")), []).append(
-            {"before": row, "after": later.get((row.get("condition"), row.get("name")))})
+            {"before": row, "after": now, "off_before": _off(row), "off_after": now is not None and _off(now)})
     return [{"condition": name, "rows": rows} for name, rows in groups.items()]
+
+
+def _off(metric: Part) -> bool:
+    """Whether the model's figure is more than two standard deviations of the closures away."""
+    measured, sd, model = (text.known(metric.get(k)) for k in ("measured", "sd", "model"))
+    if measured is None or sd is None or model is None:
+        return False
+    return abs(measured - model) > max(2.0 * sd, 1e-9 * abs(measured))
 
 
 def nuisances(diagnosis: Part | None) -> dict[str, Any] | None:
@@ -391,7 +424,7 @@ def _model_names(comparison: Part | None, after: Part | None, diagnosis: Part | 
 
 
 def _models(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> list[dict[str, str]]:
-    rows = [("compared", comparison), ("compared, after", after), ("of the diagnosis", diagnosis)]
+    rows = [("before", comparison), ("after", after), ("diagnosed", diagnosis)]
     out = [{"role": role, "name": str((part.get("model") or {}).get("name", "")),
             "sha256": str((part.get("model") or {}).get("sha256", ""))} for role, part in rows if part is not None]
     return [m for m in out if m["name"] or m["sha256"]]

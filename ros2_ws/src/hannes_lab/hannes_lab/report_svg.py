@@ -43,6 +43,7 @@ def series(source: Mapping[str, Any], name: str) -> list[float | None]:
 
 
 def difference(a: Values, b: Values) -> list[float | None]:
+    """A - b, None where either is not known."""
     return [None if x is None or y is None else x - y for x, y in zip(a, b, strict=False)]
 
 
@@ -142,6 +143,9 @@ def overlay_svg(overlay: Mapping[str, Any], after: Mapping[str, Any] | None) -> 
     return Markup("").join(out)
 
 
+STANDING = 1e-3
+"""rad/s below which the machine stands, as in the dependences."""
+
 PHASE_NAMES = ("void", "grasp", "hold", "opening", "rest")
 
 
@@ -161,20 +165,26 @@ def tick_text(value: float) -> str:
 def curve_svg(curves: Sequence[tuple[str, Sequence[float | None], Sequence[float | None]]], *, steps: bool) -> Markup:
     """Small curves of residual against a variable; stretched by the page, so lines only, no text.
 
-    curves  (class, centres, values); steps: the variable has few values, shown as separate points
+    curves  (class, centres, values); steps: velocities stand for directions, one bar each
     """
     width, height = 200.0, 90.0
+    y = Scale([0.0, *(v for _, _, ys in curves for v in ys)], height - 6.0, 6.0, 0.0)
     x = Scale([v for _, xs, _ in curves for v in xs], 6.0, width - 6.0, 0.0)
-    y = Scale([0.0, *(v for _, _, ys in curves for v in ys)], height - 6.0, 6.0, 0.06)
+    zero = y(0.0)
     out = [Markup('<svg class="curve" viewBox="0 0 {:g} {:g}" preserveAspectRatio="none" aria-hidden="true">'
                   '<line class="zero" x1="0" x2="{:g}" y1="{:.1f}" y2="{:.1f}"/>').format(
-        width, height, width, y(0.0), y(0.0))]
-    for name, xs, ys in curves:
-        if not steps:
-            out.append(Markup('<path class="line-{}" d="{}"/>').format(name, path(xs, ys, x, y)))
-        for a, b in zip(xs, ys, strict=False):
-            if a is not None and b is not None:
-                # A line of no length with round caps stays round however the picture is stretched.
-                out.append(Markup('<path class="dot-{}" d="M{:.1f} {:.1f}h.01"/>').format(name, x(a), y(b)))
+        width, height, width, zero, zero)]
+    for k, (name, xs, ys) in enumerate(curves):
+        points = [(a, b) for a, b in zip(xs, ys, strict=False) if a is not None and b is not None]
+        if steps:
+            # One bar a direction: opening, standing, closing stand at thirds of the width.
+            for a, b in points:
+                third = 0 if a < -STANDING else 2 if a > STANDING else 1
+                at = width * (third + 0.5) / 3.0 + 12.0 * (k - (len(curves) - 1) / 2.0)
+                out.append(Markup('<path class="bar-{}" d="M{:.1f} {:.1f}V{:.1f}"/>').format(name, at, zero, y(b)))
+            continue
+        out.append(Markup('<path class="line-{}" d="{}"/>').format(name, path(xs, ys, x, y)))
+        # A line of no length with round caps stays round however the picture is stretched.
+        out += [Markup('<path class="dot-{}" d="M{:.1f} {:.1f}h.01"/>').format(name, x(a), y(b)) for a, b in points]
     out.append(Markup("</svg>"))
     return Markup("").join(out)

@@ -66,10 +66,10 @@ def percent(value: Any, places: int = 0) -> str:
     if v is None:
         return DASH
     if 0.0 < v < 0.5 * 10.0 ** (-2 - places):
-        return f"< {fixed(10.0**-places, places)} %"
+        return f"< {fixed(10.0**-places, places)}\u00a0%"
     if 1.0 - 0.5 * 10.0 ** (-2 - places) < v < 1.0:
-        return f"> {fixed(100.0 - 10.0**-places, places)} %"
-    return f"{fixed(100.0 * v, places)} %"
+        return f"> {fixed(100.0 - 10.0**-places, places)}\u00a0%"
+    return f"{fixed(100.0 * v, places)}\u00a0%"
 
 
 def signed_percent(value: Any) -> str:
@@ -78,7 +78,7 @@ def signed_percent(value: Any) -> str:
     if v is None:
         return DASH
     text = fixed(v, 1 if abs(v) < 99.95 else 0)
-    return f"{'+' if v > 0 and text.strip('0.') else ''}{text} %"
+    return f"{'+' if v > 0 and text.strip('0.') else ''}{text}\u00a0%"
 
 
 def plus_minus(value: Any, sd: Any, digits: int = 3) -> str:

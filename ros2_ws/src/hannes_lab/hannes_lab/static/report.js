@@ -65,7 +65,7 @@
 
   function digits(v, reference) {
     if (v == null) return "–";
-    var places = Math.max(0, Math.min(6, 3 - Math.floor(Math.log10(reference || 1))));
+    var places = Math.max(0, Math.min(7, 2 - Math.floor(Math.log10(reference || 1))));
     return v.toFixed(places).replace("-", "−");
   }
 
@@ -76,6 +76,12 @@
     }, extra);
   }
 
+  function padded(u, low, high) {
+    if (low == null || high == null) return [-1, 1];
+    var pad = high > low ? 0.07 * (high - low) : 0.1 * Math.abs(high) || 1;
+    return [low - pad, high + pad];
+  }
+
   function Panel(figure) {
     var o = data.comparison.overlays[+figure.dataset.overlay];
     var later = figure.dataset.after === undefined ? null : data.after.overlays[+figure.dataset.after];
@@ -84,13 +90,14 @@
     var reference = o.signal === "encoder_position" ? o.reference : null;
     var spread = minus(o.high, o.measured);
     var size = Math.max.apply(null, o.measured.concat(o.model).map(function (v) { return Math.abs(v || 0); })) || 1;
+    var small = Math.max.apply(null, minus(o.measured, o.model).concat(spread).map(function (v) { return Math.abs(v || 0); })) || size;
     var runs = phaseRuns(o), self = this, plots = [];
     this.group = figure.dataset.group.replace(/^\d+-/, "");
     this.zoomed = null;
 
     function lines(specs) {
       return [{}].concat(specs.map(function (s) {
-        return { label: s[0], stroke: s[1] && colour(s[1]), width: s[1] ? 1.6 : 0, dash: s[2], points: { show: false },
+        return { label: s[0], stroke: s[1] && colour(s[1]), width: s[1] ? (s[1] === "measured-line" ? 3.6 : 1.6) : 0, dash: s[2], points: { show: false },
                  show: s[3] === undefined ? true : shown[s[3]], spanGaps: false, key: s[3] };
       }));
     }
@@ -100,7 +107,7 @@
       var width = box.clientWidth || 480;
       var specs = [["high", null, null, "measured"], ["low", null, null, "measured"]], values = [o.time, o.high, o.low];
       if (reference) { specs.push(["reference", "reference", [2, 4], "reference"]); values.push(reference); }
-      specs.push(["measured", "measured", null, "measured"], ["before", "before", null, "before"]);
+      specs.push(["measured", "measured-line", null, "measured"], ["before", "before", null, "before"]);
       values.push(o.measured, o.model);
       if (after) { specs.push(["after", "after", null, "after"]); values.push(after); }
       var rspecs = [["high", null, null, "measured"], ["low", null, null, "measured"], ["before", "before", null, "before"]];
@@ -111,7 +118,7 @@
           width: width, height: height, legend: { show: false }, padding: [top, 8, 0, 0],
           cursor: { sync: { key: self.group, scales: ["x", null] }, points: { size: 6 }, drag: { x: true, y: false, setScale: false },
                     y: false, focus: { prox: -1 } },
-          scales: { x: { time: false } }, series: lines(specs),
+          scales: { x: { time: false }, y: { range: padded } }, series: lines(specs),
           bands: [{ series: [1, 2], fill: colour("band") }],
           axes: [axis({ size: xaxis ? 28 : 0, show: xaxis, values: function (u, v) {
                    return v.map(function (x, k) { return String(+x.toFixed(6)) + (k === v.length - 1 ? " s" : ""); }); } }),
@@ -128,7 +135,7 @@
         };
       }
       plots = [new uPlot(options(210, specs, 20, true, false), values, box),
-               new uPlot(options(116, rspecs, 10, false, true), rvalues, box)];
+               new uPlot(options(126, rspecs, 10, false, true), rvalues, box)];
       plots.forEach(function (p) { p.over.addEventListener("dblclick", function () { zoom(null); }); });
       if (self.zoomed) scale(self.zoomed[0], self.zoomed[1]);
       tell(null);
@@ -145,9 +152,9 @@
       }
       if (t == null) { add("", "lower plot: measured − model, " + (o.unit || "") .replace(".", "·")); return; }
       add("", "t = " + t.toFixed(2) + " s", false);
-      add("", "measured " + digits(o.measured[k], size) + (spread[k] > 0 ? " ± " + digits(spread[k], size) : ""), true);
-      add("before", (after ? "before " : "model ") + digits(o.model[k], size) + " (residual " + digits(o.measured[k] - o.model[k], size) + ")");
-      if (after) add("after", "after " + digits(after[k], size) + " (residual " + digits(o.measured[k] - after[k], size) + ")");
+      add("", "measured " + digits(o.measured[k], size) + (spread[k] > 0 ? " ± " + digits(spread[k], small) : ""), true);
+      add("before", (after ? "before " : "model ") + digits(o.model[k], size) + " (residual " + digits(o.measured[k] - o.model[k], small) + ")");
+      if (after) add("after", "after " + digits(after[k], size) + " (residual " + digits(o.measured[k] - after[k], small) + ")");
     }
 
     function scale(a, b) { plots.forEach(function (p) { p.setScale("x", { min: a, max: b }); }); }
