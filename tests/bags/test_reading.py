@@ -138,8 +138,8 @@ def test_joints_are_ordered_by_name(tmp_path: Path) -> None:
     shuffled = ("wrist", *reversed(JOINT_NAMES))
     back = read_bag(joint_bag(tmp_path / "a", shuffled))
     assert back["joint_positions"].values[5].tolist() == [pytest.approx(0.01 * (13 - k)) for k in range(13)]
-    back = read_quietly(joint_bag(tmp_path / "b", JOINT_NAMES, velocity=False))
-    assert "joint_velocities" not in back and "no velocity" in back.warnings[0]
+    back = read_bag(joint_bag(tmp_path / "b", JOINT_NAMES, velocity=False))
+    assert "joint_velocities" not in back and not back.warnings, "velocity is optional in a JointState"
     with pytest.raises(HannesError, match="lack the joints thumb_abd"):
         read_bag(joint_bag(tmp_path / "c", JOINT_NAMES[:-1]))
 

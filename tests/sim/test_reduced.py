@@ -52,7 +52,9 @@ def test_stall_current_and_grip() -> None:
     assert reading.current == pytest.approx(2.0 / 1.49, rel=1e-6)
     torque = 0.70 * 17.45e-3 * 19 * reading.current
     most = torque / 0.006
-    held = (torque - 0.010 - 0.008 - 0.0107 - 0.0015 * 10.0) / 0.006
+    resisting = (plant.get("friction.coulomb") + plant.get("hand.coulomb") + plant.get("hand.preload")
+                 + plant.get("hand.stiffness") * 10.0)
+    held = (torque - resisting) / 0.006
     assert held < reading.grip_force < most
 
 

@@ -306,9 +306,11 @@ class _Reader:
                 field.shape[1] == 0 or bool(np.isnan(field[:, column]).all()) for _, column, field in fields
             ]
             if all(missing):
-                self.warnings.append(
-                    f"The messages on {topic} have no {signal.field}: there is no {signal.name}."
-                )
+                # velocity and effort are optional in a JointState: to leave them out is no fault
+                if signal.field == "position" or any(field.shape[1] for _, _, field in fields):
+                    self.warnings.append(
+                        f"The messages on {topic} have no {signal.field}: there is no {signal.name}."
+                    )
                 continue
             if any(field.shape[1] not in (0, len(block.names) or 1) for block, _, field in fields):
                 raise HannesError(

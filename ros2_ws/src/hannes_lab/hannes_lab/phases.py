@@ -65,7 +65,8 @@ def metrics(phase: Array, labels: NDArray[np.int64], position: Array | None, cur
         travel = position - position[0]
         top = float(travel.max())
         if top > 0.0:
-            out["closure_time"] = float(phase[np.argmax(travel >= 0.95 * top)])
+            k = int(np.argmax(travel >= 0.95 * top))
+            out["closure_time"] = float(np.interp(0.95 * top, travel[max(k - 1, 0):k + 1], phase[max(k - 1, 0):k + 1]))
     if current is not None:
         i = np.abs(current)
         settled = phase >= TRANSIENT

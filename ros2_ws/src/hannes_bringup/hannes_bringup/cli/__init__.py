@@ -29,6 +29,7 @@ class Command:
 
 
 COMMANDS: tuple[Command, ...] = (
+    Command("demo", "hannes_bringup.cli.demo:demo", "The whole way once: graph, bags, comparison, diagnosis, report."),
     Command("run", "hannes_bringup.cli.run:app", "Start the whole node graph, or one node."),
     Command("nodes", "hannes_bringup.cli.nodes:nodes", "Show what is running: nodes, topics, rates, ages."),
     Command(
