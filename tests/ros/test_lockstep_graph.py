@@ -88,12 +88,12 @@ def test_the_whole_chain_from_emg_equals_the_rollout(peer, kind):
     assert reference[-1] > 1.0
     own = {"hand_sim": {"duration": SECONDS, "subscribers": 4}, "emg_source": {"seed": 5},
            "emg_reference": {"subscribers": 2}, "motor_controller": {"subscribers": 2}}
+    order = ("emg_source", "emg_reference", "motor_controller", "hand_sim")
     if kind == "processes":
-        order = ("emg_source", "emg_reference", "motor_controller", "hand_sim")
         nodes = [NodeProcess(name, clock="lockstep", **own[name]) for name in order]
     else:
-        nodes = [NodeProcess("composed", clock="lockstep", **{f"{node}:{k}": v for node, values in own.items()
-                                                              for k, v in values.items()})]
+        rules = {f"{node}:{key}": value for node, values in own.items() for key, value in values.items()}
+        nodes = [NodeProcess("composed", "--nodes", ",".join(order), clock="lockstep", **rules)]
     heard = run_graph(peer, *nodes)
     np.testing.assert_allclose(heard["reference_position"], reference, rtol=0, atol=1e-12)
     assert_equal(heard, in_process(heard["reference_position"], "none"))

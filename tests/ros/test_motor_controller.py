@@ -76,6 +76,19 @@ def test_lockstep_answers_each_state_with_the_law(peer):
         assert voltages(peer)[30:] == expected[:2]
 
 
+def test_another_period_than_the_simulator_s_is_one_clear_error(peer):
+    peer.hear("motor_voltage")
+    with processes(NodeProcess(NAME, clock="lockstep", period=0.002)) as (node,):
+        announce(peer)
+        say_tick(peer, 0, 0.0, 0.0, 5.0)
+        peer.until(lambda: len(voltages(peer)) == 1)
+        say_tick(peer, 1, 0.0, 0.0, 5.0)
+        peer.until(lambda: node.process.poll() is not None, what="the end of the node")
+        assert node.wait() == 2
+        assert "motor/state comes every 0.001 s, but the control period is 0.002 s" in node.output
+    assert len(voltages(peer)) == 1
+
+
 def test_wrong_joint_and_not_finite_inputs_are_rejected_and_counted(peer):
     peer.hear("motor_voltage")
     peer.hear_diagnostics()

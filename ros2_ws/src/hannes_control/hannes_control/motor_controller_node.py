@@ -81,6 +81,7 @@ class MotorController(HannesNode, LifecycleNode):
         self._stale = False
         self._start = 0
         self._answered = -1
+        self._period_ns = round(p.period * 1e9)
         self._join = TickJoin(2 if self._profile is not None else 3)
         self._loop: RealtimeLoop | None = None
         self._missed = 0
@@ -236,8 +237,12 @@ class MotorController(HannesNode, LifecycleNode):
             sample, current = tick[0], tick[1]
             if sample.stamp_ns == self._answered:
                 continue
-            reference = tick[2] if self._profile is None else self._profile_at(
-                round(sample.stamp_ns / (self._p.period * 1e9)))
+            step_ns = sample.stamp_ns - self._answered
+            if self._answered >= 0 and step_ns != self._period_ns:
+                self.fail(f"motor/state comes every {step_ns * 1e-9:g} s, but the control period is "
+                          f"{self._p.period:g} s; give hand_sim and motor_controller the same period.")
+                return
+            reference = tick[2] if self._profile is None else self._profile_at(sample.stamp_ns // self._period_ns)
             self._answered = sample.stamp_ns
             self._join.synchronise()
             self._health.cycles += 1
