@@ -22,7 +22,9 @@ def test_compiled_law_equals_plain_python(law: DoublePID) -> None:
     for _ in range(500):
         reference, position, current = rng.normal(5, 4), rng.normal(5, 4), rng.normal(0, 2)
         x[C_REFERENCE], x[C_POSITION], x[C_CURRENT] = reference, position, current
-        assert law.update(reference, position, current) == pytest.approx(control(x, law.parameters, states), abs=1e-12)
+        assert law.update(reference, position, current) == pytest.approx(
+            control(x, law.parameters, states), abs=1e-12
+        )
 
 
 def test_limits_hold_and_integrator_does_not_wind_up(law: DoublePID) -> None:
@@ -72,8 +74,10 @@ def test_profiles() -> None:
     sine = half_sine(2)
     assert sine.max() == pytest.approx(FULL_CLOSURE, rel=1e-6) and sine.min() == 0.0 and sine.size == 8000
     assert np.all(sine[2001:3999] == 0.0)
-    ramp = ramp_hold(1, 10.0, 1.0, 0.5, 1.0, 0.5)
-    assert np.all(ramp[1000:1500] == 10.0) and np.abs(np.diff(ramp)).max() < 0.02
+    ramp = ramp_hold(1, 10.0, 3.0, hold=0.2, rest=0.2)
+    assert (
+        np.all(ramp[900:1500] == 10.0) and np.all(ramp[2400:] == 0.0) and np.abs(np.diff(ramp)).max() < 0.02
+    )
     assert np.any(np.diff(reversals()[:1500]) < 0.0), "reversals must reverse while closing"
     with pytest.raises(HannesError, match=r"half_sine, ramp_hold, reversals"):
         make_profile("square")

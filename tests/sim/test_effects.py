@@ -17,17 +17,37 @@ from hannes_sim.rollout import Rollout, rollout
 
 NAMES = sorted(catalogue())
 EXPECTED = {
-    "viscous_friction", "coulomb_friction", "stribeck_friction", "load_dependent_friction",
-    "direction_dependent_friction", "wire_slack", "wire_elasticity", "glove_stiffness", "glove_hysteresis",
-    "gearbox_inertia", "gear_backlash", "cogging", "gravity", "return_preload", "winding_heating", "supply_sag",
-    "brush_drop", "current_sensor", "encoder_offset", "encoder_eccentricity", "command_delay", "object_damping",
+    "viscous_friction",
+    "coulomb_friction",
+    "stribeck_friction",
+    "load_dependent_friction",
+    "direction_dependent_friction",
+    "wire_slack",
+    "wire_elasticity",
+    "glove_stiffness",
+    "glove_hysteresis",
+    "gearbox_inertia",
+    "gear_backlash",
+    "cogging",
+    "gravity",
+    "return_preload",
+    "winding_heating",
+    "supply_sag",
+    "brush_drop",
+    "current_sensor",
+    "encoder_offset",
+    "encoder_eccentricity",
+    "command_delay",
+    "object_damping",
 }
 
 
 def runs(model: Model) -> list[Rollout]:
     law = DoublePID.of_model(model.parameters)
-    return [rollout(make_plant(model, OBJECTS[grasp]), law, half_sine(1, period=period), joints=False)
-            for period, grasp in ((2.0, "none"), (2.0, "rigid"))]
+    return [
+        rollout(make_plant(model, OBJECTS[grasp]), law, half_sine(1, period=period), joints=False)
+        for period, grasp in ((2.0, "none"), (2.0, "rigid"))
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +71,10 @@ def test_vanishes_exactly(name: str, nominal: list[Rollout]) -> None:
 def test_every_parameter_moves_an_output(name: str) -> None:
     """A parameter that does nothing is an error (it would be fitted to noise)."""
     effect = load_effect(name)
-    strong = {p.name: p.typical if p.typical != p.vanishing else 0.5 * (p.typical + p.upper) for p in effect.parameters}
+    strong = {
+        p.name: p.typical if p.typical != p.vanishing else 0.5 * (p.typical + p.upper)
+        for p in effect.parameters
+    }
     base = runs(Model.load().with_effect(effect.entry(strong)))
     for p in effect.parameters:
         value = p.vanishing if p.vanishing is not None else min(p.upper, 1.7 * strong[p.name])
@@ -73,14 +96,22 @@ def test_equations_by_hand() -> None:
     assert evaluate(load_effect("viscous_friction"), {"coefficient": 2e-3}, {})[DAMPING] == 2e-3
     assert evaluate(load_effect("wire_slack"), {"slack": 0.7}, {})[SLACK] == 0.7
     stribeck = {"stiction": 0.02, "velocity": 2.0}
-    assert evaluate(load_effect("stribeck_friction"), stribeck, {V: 2.0})[FRICTION] == pytest.approx(0.02 / math.e)
-    assert evaluate(load_effect("load_dependent_friction"), {"coefficient": 0.1}, {LOAD: 0.3})[FRICTION] == pytest.approx(0.03)
+    assert evaluate(load_effect("stribeck_friction"), stribeck, {V: 2.0})[FRICTION] == pytest.approx(
+        0.02 / math.e
+    )
+    assert evaluate(load_effect("load_dependent_friction"), {"coefficient": 0.1}, {LOAD: 0.3})[
+        FRICTION
+    ] == pytest.approx(0.03)
     glove = evaluate(load_effect("glove_stiffness"), {"stiffness": 1e-3, "hardening": 1e-6}, {QL: 10.0})
     assert glove.sum() == pytest.approx(-(1e-3 * 10 + 1e-6 * 1000))
     states = np.zeros(1)
     for _ in range(200_000):
-        evaluate(load_effect("winding_heating"), {"thermal_resistance": 10.0, "time_constant": 5.0},
-                 {CURRENT: 1.0, RESISTANCE: 1.5, DT: 1e-3}, states)
+        evaluate(
+            load_effect("winding_heating"),
+            {"thermal_resistance": 10.0, "time_constant": 5.0},
+            {CURRENT: 1.0, RESISTANCE: 1.5, DT: 1e-3},
+            states,
+        )
     # T = Rth R i2 / (1 - alpha Rth R i2): the resistance grows with the temperature
     assert states[0] == pytest.approx(15.0 / (1 - 0.0039 * 15.0), rel=1e-3)
 
@@ -95,7 +126,8 @@ def test_own_effect_from_a_file(tmp_path: Path, nominal: list[Rollout]) -> None:
         "    parameters = (EffectParameter('k', 'N.m/rad', 0.0, 0.1, 1e-3, 0.0, 'rate'),)\n\n"
         "    @staticmethod\n"
         "    def contribute(x, p, s, y):\n"
-        "        y[TORQUE] -= p[0] * x[QL]\n")
+        "        y[TORQUE] -= p[0] * x[QL]\n"
+    )
     source = f"{file}:Spring"
     effect = load_effect(source)
     model = Model.load().with_effect(effect.entry({"k": 2e-3}, source=source))
@@ -105,11 +137,14 @@ def test_own_effect_from_a_file(tmp_path: Path, nominal: list[Rollout]) -> None:
     assert np.abs(changed[0].encoder_position - nominal[0].encoder_position).max() > 0.05
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("class A:\n    pass\n", "not a subclass"),
-    ("import nothing_like_this\nclass A: pass\n", "cannot be imported"),
-    ("from hannes_sim.effect import Effect\nclass A(Effect):\n    name='a'\n", "declares no parameters"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("class A:\n    pass\n", "not a subclass"),
+        ("import nothing_like_this\nclass A: pass\n", "cannot be imported"),
+        ("from hannes_sim.effect import Effect\nclass A(Effect):\n    name='a'\n", "declares no parameters"),
+    ],
+)
 def test_broken_effect_files_give_one_clear_error(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / f"broken_{abs(hash(text))}.py"
     file.write_text(text)
@@ -124,7 +159,7 @@ def test_uncompilable_effect_names_itself() -> None:
 
         @staticmethod
         def contribute(x, p, s, y):  # type: ignore[no-untyped-def]
-            y["word"] = open("nothing")
+            y["word"] = str(x)
 
     from hannes_sim.effect import compile_effect
 

@@ -105,8 +105,11 @@ def test_effects_act_on_every_plant(model: Model) -> None:
     law = DoublePID.of_model(model.parameters)
     reference = half_sine(1, amplitude=10.0, period=2.0)
     base = rollout(make_plant(model), law, reference)
-    for name, values in (("viscous_friction", {"coefficient": 3e-3}), ("coulomb_friction", {"level": 0.02}),
-                         ("glove_stiffness", {"stiffness": 4e-3, "hardening": 0.0})):
+    for name, values in (
+        ("viscous_friction", {"coefficient": 3e-3}),
+        ("coulomb_friction", {"level": 0.02}),
+        ("glove_stiffness", {"stiffness": 4e-3, "hardening": 0.0}),
+    ):
         run = rollout(make_plant(model.with_effect(load_effect(name).entry(values))), law, reference)
         closing = slice(200, 450)
         assert run.motor_current[closing].mean() > 1.1 * base.motor_current[closing].mean(), name

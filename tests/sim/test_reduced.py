@@ -34,7 +34,13 @@ def test_no_load_speed_and_time_constant() -> None:
     plant.advance(6.0, 400)
     assert plant.read().velocity == pytest.approx(6.0 / (kt * n), rel=1e-6)
     fine = ReducedPlant(Model.load(), dt=1e-6)
-    for name in ("wire.stiffness", "friction.coulomb", "friction.viscous", "encoder.resolution", "motor.inductance"):
+    for name in (
+        "wire.stiffness",
+        "friction.coulomb",
+        "friction.viscous",
+        "encoder.resolution",
+        "motor.inductance",
+    ):
         fine.set(name, 0.0)
     fine.reset()
     steps = round(tau / 1e-6)
@@ -52,8 +58,12 @@ def test_stall_current_and_grip() -> None:
     assert reading.current == pytest.approx(2.0 / 1.49, rel=1e-6)
     torque = 0.70 * 17.45e-3 * 19 * reading.current
     most = torque / 0.006
-    resisting = (plant.get("friction.coulomb") + plant.get("hand.coulomb") + plant.get("hand.preload")
-                 + plant.get("hand.stiffness") * 10.0)
+    resisting = (
+        plant.get("friction.coulomb")
+        + plant.get("hand.coulomb")
+        + plant.get("hand.preload")
+        + plant.get("hand.stiffness") * 10.0
+    )
     held = (torque - resisting) / 0.006
     assert held < reading.grip_force < most
 
@@ -87,8 +97,9 @@ def test_divergence_is_an_error_that_names_the_coordinate() -> None:
 
 def test_object_place_follows_its_size() -> None:
     small, large = GraspObject(size=0.03), GraspObject(size=0.06)
-    assert ReducedPlant(Model.load(), small).get("object.position") - ReducedPlant(
-        Model.load(), large).get("object.position") == pytest.approx(0.03 / 0.006)
+    assert ReducedPlant(Model.load(), small).get("object.position") - ReducedPlant(Model.load(), large).get(
+        "object.position"
+    ) == pytest.approx(0.03 / 0.006)
 
 
 def test_sensors_rectify_average_and_sample() -> None:

@@ -17,9 +17,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import cfunc, types
-from numpy.typing import NDArray
-
 from hannes_description.control_ports import (
     C_CURRENT,
     C_PERIOD,
@@ -29,9 +26,13 @@ from hannes_description.control_ports import (
 )
 from hannes_description.errors import HannesError
 from hannes_description.parameters import ParameterSet
+from numba import cfunc, types
+from numpy.typing import NDArray
 
 # Order of the parameters in the flat array = order of the fields of DoublePIDParameters.
-_KP, _DAMPING, _FILTER, _CURRENT_KP, _CURRENT_KI, _I_MAX, _U_MAX, _SAVER_I, _SAVER_T, _SAVER_RELEASE = range(10)
+_KP, _DAMPING, _FILTER, _CURRENT_KP, _CURRENT_KI, _I_MAX, _U_MAX, _SAVER_I, _SAVER_T, _SAVER_RELEASE = range(
+    10
+)
 
 # States
 _INTEGRAL, _LAST_POSITION, _VELOCITY, _STARTED, _SAVER_CLOCK, _SAVING, _SAVED_REFERENCE, _I_REF = range(8)
@@ -69,7 +70,9 @@ class DoublePIDParameters:
         for item in fields(self):
             value = getattr(self, item.name)
             if not math.isfinite(value) or value < 0.0:
-                raise HannesError(f"Controller parameter '{item.name}' is {value}; it must be finite and at least 0.")
+                raise HannesError(
+                    f"Controller parameter '{item.name}' is {value}; it must be finite and at least 0."
+                )
         for name in ("current_limit", "voltage_limit"):
             if getattr(self, name) == 0.0:
                 raise HannesError(f"Controller parameter '{name}' is 0: the motor could never move.")
@@ -82,10 +85,18 @@ class DoublePIDParameters:
         """
         c, m = parameters.values_of("control"), parameters.values_of("motor")
         tau = c["current_time_constant"]
-        return cls(kp=c["kp"], damping=c["damping"], velocity_filter=c["velocity_filter"],
-                   current_kp=m["inductance"] / tau, current_ki=m["resistance"] / tau,
-                   current_limit=m["current_limit"], voltage_limit=parameters.value("supply.voltage"),
-                   saver_current=c["saver_current"], saver_time=c["saver_time"], saver_release=c["saver_release"])
+        return cls(
+            kp=c["kp"],
+            damping=c["damping"],
+            velocity_filter=c["velocity_filter"],
+            current_kp=m["inductance"] / tau,
+            current_ki=m["resistance"] / tau,
+            current_limit=m["current_limit"],
+            voltage_limit=parameters.value("supply.voltage"),
+            saver_current=c["saver_current"],
+            saver_time=c["saver_time"],
+            saver_release=c["saver_release"],
+        )
 
     def to_array(self) -> NDArray[np.float64]:
         return np.array(list(asdict(self).values()), dtype=np.float64)
@@ -161,8 +172,10 @@ class DoublePID:
         self._function = compiled_control()
         self.address: int = self._function.address
         self._call = self._function.ctypes
-        self._pointers = [a.ctypes.data_as(self._call.argtypes[k])
-                          for k, a in enumerate((self._inputs, self.parameters, self.states))]
+        self._pointers = [
+            a.ctypes.data_as(self._call.argtypes[k])
+            for k, a in enumerate((self._inputs, self.parameters, self.states))
+        ]
 
     @classmethod
     def of_model(cls, parameters: ParameterSet, period: float = 1e-3) -> DoublePID:
@@ -178,8 +191,10 @@ class DoublePID:
         Raises HannesError when an input is not finite: such a value must never reach the motor.
         """
         if not (math.isfinite(reference) and math.isfinite(position) and math.isfinite(current)):
-            raise HannesError(f"Controller input is not finite: reference {reference}, position {position}, "
-                              f"current {current}.")
+            raise HannesError(
+                f"Controller input is not finite: reference {reference}, position {position}, "
+                f"current {current}."
+            )
         self._inputs[C_REFERENCE] = reference
         self._inputs[C_POSITION] = position
         self._inputs[C_CURRENT] = current

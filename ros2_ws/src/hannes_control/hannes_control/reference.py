@@ -6,10 +6,9 @@ import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
-
 from hannes_description.errors import HannesError
 from hannes_description.joints import RAD_PER_COUNT
+from numpy.typing import NDArray
 
 FULL_CLOSURE = 40000 * RAD_PER_COUNT
 """rad; amplitude of the thesis' bench test (P17: 40000 counts)."""
@@ -23,35 +22,66 @@ def _check(**values: float) -> None:
             raise HannesError(f"Reference profile: {name} is {value}; it must be a positive number.")
 
 
-def half_sine(closures: int = 1, amplitude: float = FULL_CLOSURE, period: float = 4.0, dt: float = 1e-3) -> Profile:
+def half_sine(
+    closures: int = 1, amplitude: float = FULL_CLOSURE, period: float = 4.0, dt: float = 1e-3
+) -> Profile:
     """max(0, amplitude sin(2 pi t / period)), `closures` periods sampled at dt: thesis P17 as read in X01."""
     _check(closures=closures, amplitude=amplitude, period=period, dt=dt)
     t = np.arange(round(closures * period / dt)) * dt
     return np.maximum(0.0, amplitude * np.sin(2.0 * math.pi * t / period))
 
 
-def ramp_hold(closures: int = 1, amplitude: float = FULL_CLOSURE, rise: float = 1.0, hold: float = 0.5,
-              fall: float = 1.0, rest: float = 0.5, dt: float = 1e-3) -> Profile:
-    """Rise, hold, fall and rest, `closures` times; rise and fall are raised cosines (continuous velocity)."""
-    _check(closures=closures, amplitude=amplitude, rise=rise, hold=hold, fall=fall, rest=rest, dt=dt)
-    up = 0.5 - 0.5 * np.cos(math.pi * np.arange(round(rise / dt)) * dt / rise)
-    down = 0.5 + 0.5 * np.cos(math.pi * np.arange(round(fall / dt)) * dt / fall)
-    one = np.concatenate([up, np.ones(round(hold / dt)), down, np.zeros(round(rest / dt))])
+def ramp_hold(
+    closures: int = 1,
+    amplitude: float = FULL_CLOSURE,
+    period: float = 3.0,
+    hold: float = 0.2,
+    rest: float = 0.2,
+    dt: float = 1e-3,
+) -> Profile:
+    """Rise, hold, fall and rest, `closures` times; rise and fall are raised cosines (continuous velocity).
+
+    hold and rest are shares of the period; rise and fall take half of what is left each.
+    """
+    _check(closures=closures, amplitude=amplitude, period=period, hold=hold, rest=rest, dt=dt)
+    if hold + rest >= 1.0:
+        raise HannesError(
+            f"Reference profile: hold {hold} and rest {rest} leave nothing of the period to move in."
+        )
+    n = [round(share * period / dt) for share in ((1.0 - hold - rest) / 2.0, hold, rest)]
+    up = 0.5 - 0.5 * np.cos(math.pi * np.arange(n[0]) / n[0])
+    one = np.concatenate([up, np.ones(n[1]), 1.0 - up, np.zeros(n[2])])
     return amplitude * np.tile(one, closures)
 
 
-def reversals(closures: int = 1, amplitude: float = FULL_CLOSURE, period: float = 6.0, ripple: float = 0.15,
-              ripple_period: float = 0.6, dt: float = 1e-3) -> Profile:
+def reversals(
+    closures: int = 1,
+    amplitude: float = FULL_CLOSURE,
+    period: float = 6.0,
+    ripple: float = 0.15,
+    ripple_period: float = 0.6,
+    dt: float = 1e-3,
+) -> Profile:
     """A half sine with small reversals on top: shows slack, backlash, presliding and inertia."""
-    _check(closures=closures, amplitude=amplitude, period=period, ripple=ripple, ripple_period=ripple_period, dt=dt)
+    _check(
+        closures=closures,
+        amplitude=amplitude,
+        period=period,
+        ripple=ripple,
+        ripple_period=ripple_period,
+        dt=dt,
+    )
     slow = half_sine(closures, 1.0, period, dt)
     t = np.arange(slow.size) * dt
     wave = ripple * np.sin(2.0 * math.pi * t / ripple_period) * np.minimum(1.0, 4.0 * slow) * (slow > 0.0)
     return amplitude * np.clip(slow * (1.0 - ripple) + wave, 0.0, 1.0)
 
 
-PROFILES: Mapping[str, Callable[..., Profile]] = {"half_sine": half_sine, "ramp_hold": ramp_hold,
-                                                  "reversals": reversals}
+PROFILES: Mapping[str, Callable[..., Profile]] = {
+    "half_sine": half_sine,
+    "ramp_hold": ramp_hold,
+    "reversals": reversals,
+}
 """Profiles by name, for nodes and the command line."""
 
 

@@ -15,7 +15,17 @@ from .errors import HannesError
 from .parameters import Parameter, ParameterSet, data_path, load_parameters, read_yaml
 
 SCHEMA = "hannes/model/1"
-_KEYS = ("schema", "name", "plant", "controller", "variant", "parameters", "overrides", "effects", "provenance")
+_KEYS = (
+    "schema",
+    "name",
+    "plant",
+    "controller",
+    "variant",
+    "parameters",
+    "overrides",
+    "effects",
+    "provenance",
+)
 
 
 @dataclass(frozen=True)
@@ -62,14 +72,17 @@ class Model:
         names = [effect.name for effect in self.effects]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise HannesError(f"Model '{self.name}': effect {twice[0]} is listed twice; give each effect once.")
+            raise HannesError(
+                f"Model '{self.name}': effect {twice[0]} is listed twice; give each effect once."
+            )
 
     # -- change -------------------------------------------------------------------------------------------------
     def with_plant(self, plant: str) -> Model:
         return replace(self, plant=plant)
 
-    def with_values(self, values: Mapping[str, float], *, status: str | None = None,
-                    source: str | None = None) -> Model:
+    def with_values(
+        self, values: Mapping[str, float], *, status: str | None = None, source: str | None = None
+    ) -> Model:
         """Other values of named parameters (dotted names)."""
         return replace(self, parameters=self.parameters.with_values(values, status=status, source=source))
 
@@ -85,26 +98,40 @@ class Model:
     @property
     def sha256(self) -> str:
         """Hash of all that changes the simulation (not of name and provenance)."""
-        content = {"plant": self.plant, "controller": self.controller, "variant": dict(self.variant),
-                   "parameters": self.parameters.sha256,
-                   "effects": [[e.name, e.source, e.values] for e in self.effects]}
+        content = {
+            "plant": self.plant,
+            "controller": self.controller,
+            "variant": dict(self.variant),
+            "parameters": self.parameters.sha256,
+            "effects": [[e.name, e.source, e.values] for e in self.effects],
+        }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain types; the parameters as overrides of the base set."""
         base = load_parameters(self.base)
         overrides = {n: p.to_dict() for n, p in self.parameters.items() if n not in base or base[n] != p}
-        return {"schema": SCHEMA, "name": self.name, "plant": self.plant, "controller": self.controller,
-                "variant": dict(self.variant), "parameters": self.base, "overrides": overrides,
-                "effects": [effect.to_dict() for effect in self.effects], "provenance": dict(self.provenance)}
+        return {
+            "schema": SCHEMA,
+            "name": self.name,
+            "plant": self.plant,
+            "controller": self.controller,
+            "variant": dict(self.variant),
+            "parameters": self.base,
+            "overrides": overrides,
+            "effects": [effect.to_dict() for effect in self.effects],
+            "provenance": dict(self.provenance),
+        }
 
     def save(self, path: str | Path) -> Path:
         """Write the model as YAML; floats keep all their digits."""
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True, width=110),
-                            encoding="utf-8")
+            path.write_text(
+                yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True, width=110),
+                encoding="utf-8",
+            )
         except OSError as error:
             raise HannesError(f"Cannot write the model file '{path}': {error}.") from error
         return path
@@ -117,8 +144,10 @@ class Model:
             path = data_path("models", f"{name_or_path}.yaml")
             if not path.exists():
                 names = sorted(p.stem for p in data_path("models").glob("*.yaml"))
-                raise HannesError(f"No model '{name_or_path}'; shipped are {', '.join(names)}, or give the path of a "
-                                  "model file (.yaml).")
+                raise HannesError(
+                    f"No model '{name_or_path}'; shipped are {', '.join(names)}, or give the path of a "
+                    "model file (.yaml)."
+                )
         content = read_yaml(path, "model file")
         where = str(path)
         if not isinstance(content, Mapping):
@@ -142,10 +171,16 @@ class Model:
         provenance = content.get("provenance") or {}
         if not isinstance(variant, Mapping) or not isinstance(provenance, Mapping):
             raise HannesError(f"{where}: 'variant' and 'provenance' must be mappings.")
-        return cls(name=str(content.get("name", path.stem)), plant=str(content.get("plant", "reduced")),
-                   parameters=ParameterSet(changed, parameters.source), base=str(base_path),
-                   controller=str(content.get("controller", "double_pid")), variant=variant,
-                   effects=_read_effects(content.get("effects") or [], where), provenance=provenance)
+        return cls(
+            name=str(content.get("name", path.stem)),
+            plant=str(content.get("plant", "reduced")),
+            parameters=ParameterSet(changed, parameters.source),
+            base=str(base_path),
+            controller=str(content.get("controller", "double_pid")),
+            variant=variant,
+            effects=_read_effects(content.get("effects") or [], where),
+            provenance=provenance,
+        )
 
 
 def _read_effects(content: object, where: str) -> tuple[EffectEntry, ...]:
@@ -153,13 +188,19 @@ def _read_effects(content: object, where: str) -> tuple[EffectEntry, ...]:
         raise HannesError(f"{where}: 'effects' must be a list of entries with name and parameters.")
     entries = []
     for item in content:
-        if not isinstance(item, Mapping) or "name" not in item or not isinstance(item.get("parameters"), Mapping):
+        if (
+            not isinstance(item, Mapping)
+            or "name" not in item
+            or not isinstance(item.get("parameters"), Mapping)
+        ):
             raise HannesError(f"{where}: every effect needs 'name' and 'parameters'.")
         unknown = sorted(set(item) - {"name", "source", "parameters"}, key=str)
         if unknown:
             raise HannesError(f"{where}: effect '{item['name']}': unknown keys {unknown}.")
-        parameters = {str(n): Parameter.from_dict(f"{item['name']}.{n}", p, where)
-                      for n, p in item["parameters"].items()}
+        parameters = {
+            str(n): Parameter.from_dict(f"{item['name']}.{n}", p, where)
+            for n, p in item["parameters"].items()
+        }
         source = item.get("source")
         entries.append(EffectEntry(str(item["name"]), parameters, str(source) if source else None))
     return tuple(entries)

@@ -42,37 +42,61 @@ class Parameter:
             if not math.isfinite(getattr(self, key)):
                 raise HannesError(f"{key} is {getattr(self, key)}; it must be a finite number.")
         if not self.lower <= self.value <= self.upper:
-            raise HannesError(f"value {self.value} {self.unit} is outside its bounds [{self.lower}, {self.upper}].")
+            raise HannesError(
+                f"value {self.value} {self.unit} is outside its bounds [{self.lower}, {self.upper}]."
+            )
         if self.status not in STATUSES:
             raise HannesError(f"status {self.status!r} is unknown; valid are {', '.join(STATUSES)}.")
 
     def at(self, value: float, *, status: str | None = None, source: str | None = None) -> Parameter:
         """The same parameter with another value; the bounds are widened where they would exclude it."""
-        return replace(self, value=float(value), lower=min(self.lower, float(value)),
-                       upper=max(self.upper, float(value)), status=status or self.status,
-                       source=source or self.source)
+        return replace(
+            self,
+            value=float(value),
+            lower=min(self.lower, float(value)),
+            upper=max(self.upper, float(value)),
+            status=status or self.status,
+            source=source or self.source,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain types, for YAML and JSON; `fixed` only where it is set."""
-        out: dict[str, Any] = {"value": self.value, "unit": self.unit, "lower": self.lower, "upper": self.upper,
-                               "status": self.status, "source": self.source}
+        out: dict[str, Any] = {
+            "value": self.value,
+            "unit": self.unit,
+            "lower": self.lower,
+            "upper": self.upper,
+            "status": self.status,
+            "source": self.source,
+        }
         return out | {"fixed": True} if self.fixed else out
 
     @classmethod
     def from_dict(cls, name: str, entry: object, where: str) -> Parameter:
         """Read one entry of a YAML file; errors name the parameter and the file."""
         if not isinstance(entry, Mapping):
-            raise HannesError(f"{where}: parameter '{name}' must be a mapping with the keys {', '.join(_KEYS)}.")
+            raise HannesError(
+                f"{where}: parameter '{name}' must be a mapping with the keys {', '.join(_KEYS)}."
+            )
         unknown = sorted(set(entry) - set(_KEYS), key=str)
         missing = [key for key in _KEYS[:6] if key not in entry]
         if unknown or missing:
-            raise HannesError(f"{where}: parameter '{name}': "
-                              + (f"unknown keys {unknown}; " if unknown else "")
-                              + (f"missing keys {missing}; " if missing else "")
-                              + f"valid keys are {', '.join(_KEYS)}.")
+            raise HannesError(
+                f"{where}: parameter '{name}': "
+                + (f"unknown keys {unknown}; " if unknown else "")
+                + (f"missing keys {missing}; " if missing else "")
+                + f"valid keys are {', '.join(_KEYS)}."
+            )
         try:
-            return cls(float(entry["value"]), str(entry["unit"]), float(entry["lower"]), float(entry["upper"]),
-                       str(entry["status"]), str(entry["source"]), bool(entry.get("fixed", False)))
+            return cls(
+                float(entry["value"]),
+                str(entry["unit"]),
+                float(entry["lower"]),
+                float(entry["upper"]),
+                str(entry["status"]),
+                str(entry["source"]),
+                bool(entry.get("fixed", False)),
+            )
         except (TypeError, ValueError) as error:
             raise HannesError(f"{where}: parameter '{name}': {error}") from error
 
@@ -91,8 +115,11 @@ class ParameterSet(Mapping[str, Parameter]):
         except KeyError:
             group = name.split(".")[0]
             near = [n for n in self.entries if n.split(".")[0] == group] or sorted(
-                {n.split(".")[0] + ".*" for n in self.entries})
-            raise HannesError(f"Unknown parameter '{name}' in {self.source}; valid are {', '.join(near)}.") from None
+                {n.split(".")[0] + ".*" for n in self.entries}
+            )
+            raise HannesError(
+                f"Unknown parameter '{name}' in {self.source}; valid are {', '.join(near)}."
+            ) from None
 
     def __contains__(self, name: object) -> bool:
         return name in self.entries
@@ -114,8 +141,9 @@ class ParameterSet(Mapping[str, Parameter]):
             raise HannesError(f"No parameter group '{group}' in {self.source}.")
         return out
 
-    def with_values(self, values: Mapping[str, float], *, status: str | None = None,
-                    source: str | None = None) -> ParameterSet:
+    def with_values(
+        self, values: Mapping[str, float], *, status: str | None = None, source: str | None = None
+    ) -> ParameterSet:
         """A new set in which the named parameters have other values."""
         changed = {name: self[name].at(value, status=status, source=source) for name, value in values.items()}
         return ParameterSet({**self.entries, **changed}, self.source)
@@ -180,5 +208,7 @@ def load_parameters(name_or_path: str | Path) -> ParameterSet:
         path = data_path("parameters", f"{name_or_path}.yaml")
         if not path.exists():
             names = sorted(p.stem for p in data_path("parameters").glob("*.yaml"))
-            raise HannesError(f"No parameter set '{name_or_path}'; shipped are {', '.join(names)}, or give a .yaml path.")
+            raise HannesError(
+                f"No parameter set '{name_or_path}'; shipped are {', '.join(names)}, or give a .yaml path."
+            )
     return ParameterSet.from_dict(read_yaml(path, "parameter file"), str(path))

@@ -28,11 +28,20 @@ class Addition:
     values: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
-        return {"effects": [e.to_dict() for e in self.effects], "falls": [f.to_dict() for f in self.falls],
-                "error": {"nominal": self.falls[0].held_out, "final": self.falls[-1].held_out, "repeatability": 1.0,
-                          "held_out": True, "unit": "multiples of the repeatability between closures"},
-                "data": [dict(d) for d in self.data], "notes": list(self.notes),
-                "model": {"name": self.model.name, "sha256": self.model.sha256}}
+        return {
+            "effects": [e.to_dict() for e in self.effects],
+            "falls": [f.to_dict() for f in self.falls],
+            "error": {
+                "nominal": self.falls[0].held_out,
+                "final": self.falls[-1].held_out,
+                "repeatability": 1.0,
+                "held_out": True,
+                "unit": "multiples of the repeatability between closures",
+            },
+            "data": [dict(d) for d in self.data],
+            "notes": list(self.notes),
+            "model": {"name": self.model.name, "sha256": self.model.sha256},
+        }
 
 
 def add_effects(prepared: Prepared, sources: Mapping[str, str], *, progress: Progress = silent) -> Addition:
@@ -41,7 +50,9 @@ def add_effects(prepared: Prepared, sources: Mapping[str, str], *, progress: Pro
     sources   effect name -> what load_effect takes
     """
     if not sources:
-        raise HannesError("No effect to add: give --effect NAME (see `hannes model effects`) or path.py:Class.")
+        raise HannesError(
+            "No effect to add: give --effect NAME (see `hannes model effects`) or path.py:Class."
+        )
     search = Search(prepared.problem, prepared.model, prepared.nuisances, sources, progress=progress)
     best = search.null()
     for k, name in enumerate(sources):
@@ -49,19 +60,32 @@ def add_effects(prepared: Prepared, sources: Mapping[str, str], *, progress: Pro
         best = search.polish(search.add(best, name))
     limits = chance(prepared.problem, search.null().fit, {})
     falls = error_falls(prepared, search, best, progress)
-    return Addition(with_provenance(fitted_model(prepared.model, search, best), prepared, falls),
-                    found_effects(search, best, limits, falls), falls, data_used(prepared.features), prepared.notes,
-                    best.fit.values)
+    return Addition(
+        with_provenance(fitted_model(prepared.model, search, best), prepared, falls),
+        found_effects(search, best, limits, falls),
+        falls,
+        data_used(prepared.features),
+        prepared.notes,
+        best.fit.values,
+    )
 
 
 def with_provenance(model: Model, prepared: Prepared, falls: Sequence[Fall], command: str = "") -> Model:
     """The model with what it was made from: bags with hashes, errors, command."""
-    return replace(model, provenance={
-        **dict(model.provenance),
-        "bags": [{"source": d["source"], "sha256": d["sha256"], "closures": d["closures"]}
-                 for d in data_used(prepared.features)],
-        "nominal_sha256": prepared.model.sha256,
-        "error_unit": "multiples of the repeatability between closures",
-        "falls": [{"added": f.added, "train": round(f.train, 4), "held_out": round(f.held_out, 4)} for f in falls],
-        **({"command": command} if command else {}),
-    })
+    return replace(
+        model,
+        provenance={
+            **dict(model.provenance),
+            "bags": [
+                {"source": d["source"], "sha256": d["sha256"], "closures": d["closures"]}
+                for d in data_used(prepared.features)
+            ],
+            "nominal_sha256": prepared.model.sha256,
+            "error_unit": "multiples of the repeatability between closures",
+            "falls": [
+                {"added": f.added, "train": round(f.train, 4), "held_out": round(f.held_out, 4)}
+                for f in falls
+            ],
+            **({"command": command} if command else {}),
+        },
+    )

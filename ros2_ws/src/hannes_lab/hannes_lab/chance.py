@@ -1,8 +1,8 @@
 """What chance reaches: misfit and best gain of data in which nothing is missing, from the repeats themselves.
 
 Wild bootstrap over closures: the deviations of the closures from their mean, with random signs, averaged, are one draw
-of the noise of the mean (Liu 1988, Mammen 1993).  It keeps all correlation along the closure and between signals, and it
-assumes no distribution.  With too few closures to resample, draws come from the estimated covariance instead.
+of the noise of the mean (Liu 1988, Mammen 1993).  It keeps all correlation along the closure and between signals,
+and it assumes no distribution.  With too few closures to resample, draws come from the estimated covariance instead.
 """
 
 from __future__ import annotations
@@ -56,8 +56,16 @@ def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple
     return problem.whiten(raw), True
 
 
-def chance(problem: Problem, null: Fit, signatures: Mapping[str, Sequence[Array]], *, draws: int = 400,
-           level: float = 0.98, rows: NDArray[np.bool_] | None = None, seed: int = 0) -> Chance:
+def chance(
+    problem: Problem,
+    null: Fit,
+    signatures: Mapping[str, Sequence[Array]],
+    *,
+    draws: int = 400,
+    level: float = 0.98,
+    rows: NDArray[np.bool_] | None = None,
+    seed: int = 0,
+) -> Chance:
     """Critical values at the given level, in the linear approximation around a fit.
 
     signatures   per effect, derivatives (size, k) at vanishing strength for each start of its shape parameters
@@ -81,5 +89,10 @@ def chance(problem: Problem, null: Fit, signatures: Mapping[str, Sequence[Array]
             if keep.any():
                 q, _ = np.linalg.qr(d[:, keep])
                 gains = np.maximum(gains, ((q.T @ left) ** 2).sum(axis=0))
-    return Chance(float(np.quantile(misfit, level)), float(np.quantile(gains, level)), float(np.median(misfit)), draws,
-                  resampled)
+    return Chance(
+        float(np.quantile(misfit, level)),
+        float(np.quantile(gains, level)),
+        float(np.median(misfit)),
+        draws,
+        resampled,
+    )

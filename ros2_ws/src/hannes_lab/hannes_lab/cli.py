@@ -30,9 +30,15 @@ from .prepare import Prepared, load_trials, prepare
 Bags = Annotated[list[Path], typer.Argument(help="Bags, or folders of bags; one bag may hold many closures.")]
 ModelFile = Annotated[str, typer.Option("--model", help="Model file, or the name of a shipped model.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
-Effects = Annotated[list[str] | None, typer.Option("--effect", help="Effect by name, or your own as path.py:Class.")]
-Objects = Annotated[list[str] | None, typer.Option(
-    "--object", help="What a condition holds, as CONDITION=none|soft|rigid; overrides the bag's metadata.")]
+Effects = Annotated[
+    list[str] | None, typer.Option("--effect", help="Effect by name, or your own as path.py:Class.")
+]
+Objects = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--object", help="What a condition holds, as CONDITION=none|soft|rigid; overrides the bag's metadata."
+    ),
+]
 Signals = Annotated[list[str] | None, typer.Option("--signal", help="Compare only these signals.")]
 Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Worker processes.")]
 ReportFile = Annotated[Path | None, typer.Option("--report", help="Write a self-contained HTML report here.")]
@@ -49,8 +55,14 @@ class _Progress:
         self._task: Any = None
         self._last = 0.0
         if not quiet and sys.stderr.isatty():
-            self._bar = Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"),
-                                 TimeElapsedColumn(), console=Console(stderr=True), transient=True)
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.completed}/{task.total}"),
+                TimeElapsedColumn(),
+                console=Console(stderr=True),
+                transient=True,
+            )
             self._task = self._bar.add_task("", total=1)
 
     def __enter__(self) -> _Progress:
@@ -72,7 +84,9 @@ class _Progress:
             print(f"  {text} ({done}/{total})", file=sys.stderr, flush=True)
 
 
-def _prepared(bags: Sequence[Path], model: str, objects: Sequence[str] | None, signals: Sequence[str] | None) -> Prepared:
+def _prepared(
+    bags: Sequence[Path], model: str, objects: Sequence[str] | None, signals: Sequence[str] | None
+) -> Prepared:
     given = {}
     for text in objects or ():
         name, _, what = text.partition("=")
@@ -82,9 +96,13 @@ def _prepared(bags: Sequence[Path], model: str, objects: Sequence[str] | None, s
     trials = load_trials(bags)
     unknown = sorted(set(given) - {t.name for t in trials})
     if unknown:
-        raise HannesError(f"--object names unknown conditions {', '.join(unknown)}; these bags have "
-                          f"{', '.join(t.name for t in trials)}.")
-    trials = [replace(t, options={**t.options, "object": given[t.name]}) if t.name in given else t for t in trials]
+        raise HannesError(
+            f"--object names unknown conditions {', '.join(unknown)}; these bags have "
+            f"{', '.join(t.name for t in trials)}."
+        )
+    trials = [
+        replace(t, options={**t.options, "object": given[t.name]}) if t.name in given else t for t in trials
+    ]
     return prepare(trials, Model.load(model), signals=signals)
 
 
@@ -115,9 +133,17 @@ def _command() -> str:
     return "hannes " + " ".join(shlex.quote(a) for a in sys.argv[1:])
 
 
-def compare(bags: Bags, model: ModelFile = "nominal", fitted: Annotated[bool, typer.Option(
-        "--fitted", help="Fit the uncertain nominal parameters first.")] = False, objects: Objects = None,
-        signals: Signals = None, report: ReportFile = None, json: Json = False) -> None:
+def compare(
+    bags: Bags,
+    model: ModelFile = "nominal",
+    fitted: Annotated[
+        bool, typer.Option("--fitted", help="Fit the uncertain nominal parameters first.")
+    ] = False,
+    objects: Objects = None,
+    signals: Signals = None,
+    report: ReportFile = None,
+    json: Json = False,
+) -> None:
     """Compare the model with recorded closures: where does it fail, and by how much?"""
     prepared = _prepared(bags, model, objects, signals)
     result = compare_model(prepared, fitted=fitted)
@@ -136,38 +162,70 @@ def _show_comparison(result: Comparison) -> None:
     for name in ("condition", "signal", "phase", "RMSE", "bias", "repeatability", "ratio", ""):
         table.add_column(name, justify="left" if name in ("condition", "signal", "phase", "") else "right")
     for c in result.cells:
-        table.add_row(c.condition, c.signal, c.phase, f"{_number(c.rmse, 3)} {c.unit}", _number(c.bias, 3),
-                      _number(c.repeatability, 3), _number(c.ratio, 3), "fails" if c.fails else "")
+        table.add_row(
+            c.condition,
+            c.signal,
+            c.phase,
+            f"{_number(c.rmse, 3)} {c.unit}",
+            _number(c.bias, 3),
+            _number(c.repeatability, 3),
+            _number(c.ratio, 3),
+            "fails" if c.fails else "",
+        )
     console.print(table)
     table = Table(title="Figures of the thesis")
     for name in ("condition", "figure", "measured", "sd", "model", "relative error"):
         table.add_column(name, justify="left" if name in ("condition", "figure") else "right")
     for m in result.metrics:
-        table.add_row(m.condition, m.name, f"{_number(m.measured)} {m.unit}", _number(m.sd, 2), _number(m.model),
-                      f"{_number(m.relative_error_percent, 3)} %")
+        table.add_row(
+            m.condition,
+            m.name,
+            f"{_number(m.measured)} {m.unit}",
+            _number(m.sd, 2),
+            _number(m.model),
+            f"{_number(m.relative_error_percent, 3)} %",
+        )
     console.print(table)
-    console.print("The residual depends on: " + ", ".join(f"{d.variable} {100 * d.share:.0f} %" for d in result.depends_on))
+    console.print(
+        "The residual depends on: "
+        + ", ".join(f"{d.variable} {100 * d.share:.0f} %" for d in result.depends_on)
+    )
     console.print(f"Overall error: {_number(result.overall)} times the repeatability between closures.")
     for note in result.notes:
         console.print(f"note: {note}", style="dim")
 
 
-def diagnose(bags: Bags, model: ModelFile = "nominal", effects: Effects = None,
-             only: Annotated[list[str] | None, typer.Option("--only", help="Consider only these effects.")] = None,
-             add: Annotated[bool, typer.Option("--add", help="Write the model with what was found to --out.")] = False,
-             out: Annotated[Path, typer.Option("--out", help="Model file that --add writes.")] = Path("my_hand.yaml"),
-             objects: Objects = None, signals: Signals = None, jobs: Jobs = _JOBS, report: ReportFile = None,
-             json: Json = False) -> None:
+def diagnose(
+    bags: Bags,
+    model: ModelFile = "nominal",
+    effects: Effects = None,
+    only: Annotated[list[str] | None, typer.Option("--only", help="Consider only these effects.")] = None,
+    add: Annotated[bool, typer.Option("--add", help="Write the model with what was found to --out.")] = False,
+    out: Annotated[Path, typer.Option("--out", help="Model file that --add writes.")] = Path("my_hand.yaml"),
+    objects: Objects = None,
+    signals: Signals = None,
+    jobs: Jobs = _JOBS,
+    report: ReportFile = None,
+    json: Json = False,
+) -> None:
     """Which physical effect does the model lack: nothing, effects of the catalogue, or something unknown?"""
     prepared = _prepared(bags, model, objects, signals)
     with _Progress(quiet=json) as progress:
-        found = diagnose_model(prepared, effect_sources(effects or (), only=only, model=prepared.model), jobs=jobs,
-                               progress=progress)
+        found = diagnose_model(
+            prepared,
+            effect_sources(effects or (), only=only, model=prepared.model),
+            jobs=jobs,
+            progress=progress,
+        )
     written = None
     if add:
-        written = with_provenance(replace(found.model, name=out.stem), prepared, found.falls, _command()).save(out)
+        written = with_provenance(
+            replace(found.model, name=out.stem), prepared, found.falls, _command()
+        ).save(out)
     if report:
-        _write_report(report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found)
+        _write_report(
+            report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
+        )
     if json:
         _print_json(found.to_dict() | {"model_file": str(written) if written else None})
         return
@@ -188,7 +246,9 @@ def _show_diagnosis(found: Diagnosis) -> None:
         console.print(f"\n[bold]{effect.title}[/bold] ({effect.name})")
         for name, p in effect.parameters.items():
             note = "" if p.identified else "   not identified by these data"
-            console.print(f"  {name} = {_number(p.value)} {p.unit}   95 %: {_number(p.low)} .. {_number(p.high)}{note}")
+            console.print(
+                f"  {name} = {_number(p.value)} {p.unit}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
+            )
         console.print(f"  {effect.why}")
     _show_falls(console, found)
     if found.ranking:
@@ -196,58 +256,93 @@ def _show_diagnosis(found: Diagnosis) -> None:
         for rank in found.ranking[:8]:
             console.print(f"  {100 * rank.explained:5.1f} %  {' + '.join(rank.names)}")
     for experiment in found.experiments:
-        console.print(f"\nTo tell apart {', '.join(' + '.join(n) for n in experiment.separates)}: {experiment.name} "
-                      f"(distance {_number(experiment.distance, 3)})\n  {experiment.to_dict()['command']}")
+        console.print(
+            f"\nTo tell apart {', '.join(' + '.join(n) for n in experiment.separates)}: {experiment.name} "
+            f"(distance {_number(experiment.distance, 3)})\n  {experiment.to_dict()['command']}"
+        )
     if found.verdict == "unknown":
-        console.print("\nThe rest depends on: "
-                      + ", ".join(f"{d.variable} {100 * d.share:.0f} %" for d in found.depends_on))
+        console.print(
+            "\nThe rest depends on: "
+            + ", ".join(f"{d.variable} {100 * d.share:.0f} %" for d in found.depends_on)
+        )
     for note in found.notes:
         console.print(f"note: {note}", style="dim")
 
 
 def _show_falls(console: Console, found: Diagnosis | Addition) -> None:
-    table = Table(title="Error, in multiples of the repeatability between closures (1 = as good as the hand repeats)")
+    table = Table(
+        title="Error, in multiples of the repeatability between closures (1 = as good as the hand repeats)"
+    )
     for name in ("model", "training closures", "held-out closures", "held-out conditions"):
         table.add_column(name, justify="left" if name in ("model", "held-out conditions") else "right")
     for k, fall in enumerate(found.falls):
         conditions = ", ".join(f"{c} {_number(v, 3)}" for c, v in fall.by_condition.items())
-        table.add_row(("+ " if k > 1 else "") + fall.added, _number(fall.train, 3), _number(fall.held_out, 3), conditions)
+        table.add_row(
+            ("+ " if k > 1 else "") + fall.added,
+            _number(fall.train, 3),
+            _number(fall.held_out, 3),
+            conditions,
+        )
     console.print(table)
 
 
-def add(bags: Bags, effects: Annotated[list[str], typer.Option("--effect", help="Effect by name, or path.py:Class.")],
-        model: ModelFile = "nominal",
-        out: Annotated[Path, typer.Option("--out", help="Model file to write.")] = Path("my_hand.yaml"),
-        objects: Objects = None, signals: Signals = None, report: ReportFile = None, json: Json = False) -> None:
+def add(
+    bags: Bags,
+    effects: Annotated[list[str], typer.Option("--effect", help="Effect by name, or path.py:Class.")],
+    model: ModelFile = "nominal",
+    out: Annotated[Path, typer.Option("--out", help="Model file to write.")] = Path("my_hand.yaml"),
+    objects: Objects = None,
+    signals: Signals = None,
+    report: ReportFile = None,
+    json: Json = False,
+) -> None:
     """Add effects to the model, fit them, and show the error fall on held-out data."""
     prepared = _prepared(bags, model, objects, signals)
     with _Progress(quiet=json) as progress:
         found = add_effects(prepared, effect_sources(only=effects, model=prepared.model), progress=progress)
-    path = replace(found.model, name=out.stem, provenance={**found.model.provenance, "command": _command()}).save(out)
+    path = replace(
+        found.model, name=out.stem, provenance={**found.model.provenance, "command": _command()}
+    ).save(out)
     if report:
-        _write_report(report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=None)
+        _write_report(
+            report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=None
+        )
     if json:
         _print_json(found.to_dict() | {"model_file": str(path)})
         return
     console = _console()
     for effect in found.effects:
-        values = ", ".join(f"{n} = {_number(p.value)} {p.unit} ({_number(p.low, 3)} .. {_number(p.high, 3)})"
-                           for n, p in effect.parameters.items())
+        values = ", ".join(
+            f"{n} = {_number(p.value)} {p.unit} ({_number(p.low, 3)} .. {_number(p.high, 3)})"
+            for n, p in effect.parameters.items()
+        )
         console.print(f"[bold]{effect.title}[/bold]: {values}")
     _show_falls(console, found)
     console.print(f"Model file: {path}")
     _say_report(report)
 
 
-def hide(out: Annotated[Path, typer.Argument(help="Folder for the bags, one per condition.")],
-         truth: Annotated[Path, typer.Option("--truth", help="File for the truth; keep it away from the bags.")],
-         effects: Annotated[list[str] | None, typer.Option(
-             "--effect", help="NAME, NAME=FACTOR (times its typical strength), or path.py:Class; none: nothing hidden.")] = None,
-         model: ModelFile = "nominal", seed: Annotated[int, typer.Option(help="Seed of hand, scatter and noise.")] = 0,
-         closures: Annotated[int, typer.Option(min=1, help="Closures per condition.")] = 13,
-         conditions: Annotated[list[str] | None, typer.Option("--condition", help="Conditions (default slow fast grasp).")] = None,
-         sensors: Annotated[str, typer.Option(help="thesis (30 Hz rectified current) or bench (100 Hz, signed).")] = "thesis",
-         json: Json = False) -> None:
+def hide(
+    out: Annotated[Path, typer.Argument(help="Folder for the bags, one per condition.")],
+    truth: Annotated[Path, typer.Option("--truth", help="File for the truth; keep it away from the bags.")],
+    effects: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--effect",
+            help="NAME, NAME=FACTOR (times its typical strength), or path.py:Class; none: nothing hidden.",
+        ),
+    ] = None,
+    model: ModelFile = "nominal",
+    seed: Annotated[int, typer.Option(help="Seed of hand, scatter and noise.")] = 0,
+    closures: Annotated[int, typer.Option(min=1, help="Closures per condition.")] = 13,
+    conditions: Annotated[
+        list[str] | None, typer.Option("--condition", help="Conditions (default slow fast grasp).")
+    ] = None,
+    sensors: Annotated[
+        str, typer.Option(help="thesis (30 Hz rectified current) or bench (100 Hz, signed).")
+    ] = "thesis",
+    json: Json = False,
+) -> None:
     """Make a measurement set with a hidden effect, to test the lab or to learn what an effect looks like."""
     from .hide import DEFAULT_CONDITIONS, make_set, strength_of, write_set
 
@@ -258,8 +353,14 @@ def hide(out: Annotated[Path, typer.Argument(help="Folder for the bags, one per 
             entries.append(strength_of(name, float(factor) if factor else 1.0))
         except ValueError as error:
             raise HannesError(f"--effect {text}: {error}") from error
-    recordings, hidden = make_set(Model.load(model), entries, seed=seed, closures=closures, sensors=sensors,
-                                  conditions=conditions or DEFAULT_CONDITIONS)
+    recordings, hidden = make_set(
+        Model.load(model),
+        entries,
+        seed=seed,
+        closures=closures,
+        sensors=sensors,
+        conditions=conditions or DEFAULT_CONDITIONS,
+    )
     bags = write_set(recordings, hidden, out, truth)
     if json:
         _print_json({"bags": [str(b) for b in bags], "truth": str(truth)})
@@ -267,13 +368,22 @@ def hide(out: Annotated[Path, typer.Argument(help="Folder for the bags, one per 
     typer.echo(f"{len(bags)} bags in {out}, the truth in {truth}")
 
 
-def report(bags: Bags, out: Annotated[Path, typer.Option("--out", help="HTML file to write.")] = Path("report.html"),
-           model: ModelFile = "nominal", effects: Effects = None, objects: Objects = None, signals: Signals = None,
-           jobs: Jobs = _JOBS, json: Json = False) -> None:
+def report(
+    bags: Bags,
+    out: Annotated[Path, typer.Option("--out", help="HTML file to write.")] = Path("report.html"),
+    model: ModelFile = "nominal",
+    effects: Effects = None,
+    objects: Objects = None,
+    signals: Signals = None,
+    jobs: Jobs = _JOBS,
+    json: Json = False,
+) -> None:
     """Compare, diagnose and add, all on one self-contained HTML page."""
     prepared = _prepared(bags, model, objects, signals)
     with _Progress(quiet=json) as progress:
-        found = diagnose_model(prepared, effect_sources(effects or (), model=prepared.model), jobs=jobs, progress=progress)
+        found = diagnose_model(
+            prepared, effect_sources(effects or (), model=prepared.model), jobs=jobs, progress=progress
+        )
     _write_report(out, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found)
     if json:
         _print_json({"report": str(out), "verdict": found.verdict})
@@ -282,12 +392,19 @@ def report(bags: Bags, out: Annotated[Path, typer.Option("--out", help="HTML fil
     _say_report(out)
 
 
-def _write_report(path: Path, *, comparison: Comparison, after: Comparison | None, diagnosis: Diagnosis | None) -> None:
+def _write_report(
+    path: Path, *, comparison: Comparison, after: Comparison | None, diagnosis: Diagnosis | None
+) -> None:
     from .report import write_report
 
-    write_report(path, comparison=_finite(comparison.to_dict()), after=_finite(after.to_dict()) if after else None,
-                 diagnosis=_finite(diagnosis.to_dict()) if diagnosis else None,
-                 title="Hannes: model against measurement", command=_command())
+    write_report(
+        path,
+        comparison=_finite(comparison.to_dict()),
+        after=_finite(after.to_dict()) if after else None,
+        diagnosis=_finite(diagnosis.to_dict()) if diagnosis else None,
+        title="Hannes: model against measurement",
+        command=_command(),
+    )
 
 
 def _say_report(path: Path | None) -> None:

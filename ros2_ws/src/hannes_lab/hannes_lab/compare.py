@@ -1,4 +1,7 @@
-"""Where the model fails: aligned closures, errors per signal and phase, the thesis' figures, and the residual's pattern."""
+"""Where the model fails.
+
+Aligned closures, errors per signal and phase, the thesis' figures, and the residual's pattern.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,10 @@ from numpy.typing import NDArray
 from .depends import Dependence, residual_dependences
 from .errors import UNITS, SignalError, overall, signal_errors
 from .features import Block, Features, data_used
+from .fit import fit
 from .phases import METRICS, PHASES, metrics, phase_of
 from .prepare import Prepared
 from .problem import nuisance_coordinate
-from .fit import fit
 
 Array = NDArray[np.float64]
 
@@ -64,8 +67,12 @@ class Overlay:
     phase: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        out: dict[str, Any] = {"condition": self.condition, "signal": self.signal, "unit": self.unit,
-                               "phase": list(self.phase)}
+        out: dict[str, Any] = {
+            "condition": self.condition,
+            "signal": self.signal,
+            "unit": self.unit,
+            "phase": list(self.phase),
+        }
         for name in ("time", "measured", "low", "high", "model", "reference"):
             out[name] = [float(f"{v:.6g}") for v in getattr(self, name)]
         return out
@@ -103,16 +110,23 @@ class Comparison:
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        return {"model": {"name": self.model.name, "sha256": self.model.sha256}, "fitted": self.fitted,
-                "overall": self.overall, "errors": [e.to_dict() for e in self.errors],
-                "cells": [c.to_dict() for c in self.cells], "overlays": [o.to_dict() for o in self.overlays],
-                "metrics": [m.to_dict() for m in self.metrics],
-                "depends_on": {d.variable: d.to_dict() for d in self.depends_on},
-                "data": [dict(d) for d in self.data], "notes": list(self.notes)}
+        return {
+            "model": {"name": self.model.name, "sha256": self.model.sha256},
+            "fitted": self.fitted,
+            "overall": self.overall,
+            "errors": [e.to_dict() for e in self.errors],
+            "cells": [c.to_dict() for c in self.cells],
+            "overlays": [o.to_dict() for o in self.overlays],
+            "metrics": [m.to_dict() for m in self.metrics],
+            "depends_on": {d.variable: d.to_dict() for d in self.depends_on},
+            "data": [dict(d) for d in self.data],
+            "notes": list(self.notes),
+        }
 
 
-def compare(prepared: Prepared, *, fitted: bool = False, values: Mapping[str, float] | None = None,
-            seed: int = 0) -> Comparison:
+def compare(
+    prepared: Prepared, *, fitted: bool = False, values: Mapping[str, float] | None = None, seed: int = 0
+) -> Comparison:
     """Compare the prepared model as it is, or with its nuisance parameters fitted first.
 
     values  parameters to use instead (those of a diagnosis, with its model in `prepared`)
@@ -127,11 +141,21 @@ def compare(prepared: Prepared, *, fitted: bool = False, values: Mapping[str, fl
     contact = _contact(prepared, values)
     labels = [_labels(features, block, contact) for block in features.blocks]
     errors = signal_errors(features, predicted)
-    return Comparison(model, fitted, errors, overall(errors), _cells(features, predicted, labels, seed),
-                      tuple(_overlay(features, b, p, lab) for b, p, lab in zip(features.blocks, predicted, labels,
-                                                                              strict=True)),
-                      _metrics(features, predicted, labels), residual_dependences(features, predicted),
-                      data_used(features), prepared.notes)
+    return Comparison(
+        model,
+        fitted,
+        errors,
+        overall(errors),
+        _cells(features, predicted, labels, seed),
+        tuple(
+            _overlay(features, b, p, lab)
+            for b, p, lab in zip(features.blocks, predicted, labels, strict=True)
+        ),
+        _metrics(features, predicted, labels),
+        residual_dependences(features, predicted),
+        data_used(features),
+        prepared.notes,
+    )
 
 
 def _contact(prepared: Prepared, values: Mapping[str, float]) -> dict[int, tuple[Array, Array] | None]:
@@ -146,23 +170,27 @@ def _contact(prepared: Prepared, values: Mapping[str, float]) -> dict[int, tuple
                 out[k] = None
                 continue
             force = run["grip_force"]
-            time = np.arange(force.size) * trial.period
+            time = np.arange(force.size, dtype=np.float64) * trial.period
         top = float(force.max())
         out[k] = (time, (force > 0.02 * top).astype(float)) if top > 0.0 else None
     return out
 
 
-def _labels(features: Features, block: Block, contact: Mapping[int, tuple[Array, Array] | None]) -> NDArray[np.int64]:
+def _labels(
+    features: Features, block: Block, contact: Mapping[int, tuple[Array, Array] | None]
+) -> NDArray[np.int64]:
     trial = features.trials[block.trial]
     closure = trial.of(block.condition)[min(1, len(trial.of(block.condition)) - 1)]
     touching = contact[block.trial]
-    mask = None
+    mask: NDArray[np.bool_] | None = None
     if touching is not None:
         mask = np.interp(closure.start + block.phase, *touching) > 0.5
     return phase_of(trial, closure, block.phase, mask)
 
 
-def _cells(features: Features, predicted: list[Array], labels: list[NDArray[np.int64]], seed: int) -> tuple[Cell, ...]:
+def _cells(
+    features: Features, predicted: list[Array], labels: list[NDArray[np.int64]], seed: int
+) -> tuple[Cell, ...]:
     rng = np.random.default_rng(seed)
     rows: list[dict[str, Any]] = []
     for block, model, label in zip(features.blocks, predicted, labels, strict=True):
@@ -173,7 +201,11 @@ def _cells(features: Features, predicted: list[Array], labels: list[NDArray[np.i
             own = label == k
             if own.sum() < 3:
                 continue
-            repeat = float(np.sqrt((e[:, own] ** 2).sum() / max(1, (n - 1) * own.sum()))) if n > 1 else float("nan")
+            repeat = (
+                float(np.sqrt((e[:, own] ** 2).sum() / max(1, (n - 1) * own.sum())))
+                if n > 1
+                else float("nan")
+            )
             rmse = float(np.sqrt(((block.measured - model)[:, own] ** 2).mean()))
             seen = float((residual[own] ** 2).mean())
             p = float("nan")
@@ -181,9 +213,19 @@ def _cells(features: Features, predicted: list[Array], labels: list[NDArray[np.i
                 # Means of randomly signed deviations: what the mean residual would be by scatter alone.
                 draws = rng.choice([-1.0, 1.0], size=(DRAWS, n)) @ e[:, own] / n * np.sqrt(n / (n - 1.0))
                 p = float((1 + ((draws**2).mean(axis=1) >= seen).sum()) / (1 + DRAWS))
-            rows.append({"condition": block.condition, "signal": block.signal, "phase": name,
-                         "unit": UNITS.get(block.signal, ""), "rmse": rmse, "bias": float(residual[own].mean()),
-                         "repeatability": repeat, "ratio": rmse / repeat if repeat > 0 else float("nan"), "p_value": p})
+            rows.append(
+                {
+                    "condition": block.condition,
+                    "signal": block.signal,
+                    "phase": name,
+                    "unit": UNITS.get(block.signal, ""),
+                    "rmse": rmse,
+                    "bias": float(residual[own].mean()),
+                    "repeatability": repeat,
+                    "ratio": rmse / repeat if repeat > 0 else float("nan"),
+                    "p_value": p,
+                }
+            )
     limit = _benjamini_hochberg([r["p_value"] for r in rows])
     return tuple(Cell(**r, fails=bool(r["p_value"] <= limit)) for r in rows)
 
@@ -203,12 +245,23 @@ def _overlay(features: Features, block: Block, predicted: Array, label: NDArray[
     spread = 2.0 * block.measured.std(axis=0, ddof=1) if block.n > 1 else np.zeros(block.phase.size)
     mean = block.measured.mean(axis=0)
     grid = np.arange(trial.reference.size) * trial.period
-    return Overlay(block.condition, block.signal, UNITS.get(block.signal, ""), block.phase, mean, mean - spread,
-                   mean + spread, predicted.mean(axis=0), np.interp(closure.start + block.phase, grid, trial.reference),
-                   tuple(PHASES[k] for k in label))
+    return Overlay(
+        block.condition,
+        block.signal,
+        UNITS.get(block.signal, ""),
+        block.phase,
+        mean,
+        mean - spread,
+        mean + spread,
+        predicted.mean(axis=0),
+        np.interp(closure.start + block.phase, grid, trial.reference),
+        tuple(PHASES[k] for k in label),
+    )
 
 
-def _metrics(features: Features, predicted: list[Array], labels: list[NDArray[np.int64]]) -> tuple[MetricRow, ...]:
+def _metrics(
+    features: Features, predicted: list[Array], labels: list[NDArray[np.int64]]
+) -> tuple[MetricRow, ...]:
     out = []
     for condition in features.conditions:
         own = [k for k, b in enumerate(features.blocks) if b.condition == condition]
@@ -226,14 +279,27 @@ def _metrics(features: Features, predicted: list[Array], labels: list[NDArray[np
         for source in (measured_all, predicted):
             parts = [curves(s, source) for s in ("encoder_position", "motor_current", "grip_force")]
             n = next(p.shape[0] for p in parts if p is not None)
-            sets.append([metrics(phase, label, *(None if p is None else p[min(k, p.shape[0] - 1)] for p in parts))
-                         for k in range(n)])
+            sets.append(
+                [
+                    metrics(phase, label, *(None if p is None else p[min(k, p.shape[0] - 1)] for p in parts))
+                    for k in range(n)
+                ]
+            )
         for name, unit in METRICS.items():
             m = np.array([row[name] for row in sets[0]])
             s = np.array([row[name] for row in sets[1]])
             if np.isfinite(m).any() and np.isfinite(s).any():
                 mean, model = float(np.nanmean(m)), float(np.nanmean(s))
                 sd = float(np.nanstd(m, ddof=1)) if np.isfinite(m).sum() > 1 else float("nan")
-                out.append(MetricRow(condition, name, unit, mean, sd, model,
-                                     (mean - model) / mean * 100.0 if mean else float("nan")))
+                out.append(
+                    MetricRow(
+                        condition,
+                        name,
+                        unit,
+                        mean,
+                        sd,
+                        model,
+                        (mean - model) / mean * 100.0 if mean else float("nan"),
+                    )
+                )
     return tuple(out)

@@ -32,8 +32,13 @@ class Dependence:
     curve: tuple[float, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        return {"variable": self.variable, "signal": self.signal, "share": self.share, "centres": list(self.centres),
-                "curve": list(self.curve)}
+        return {
+            "variable": self.variable,
+            "signal": self.signal,
+            "share": self.share,
+            "centres": list(self.centres),
+            "curve": list(self.curve),
+        }
 
 
 def residual_dependences(features: Features, predicted: list[Array]) -> tuple[Dependence, ...]:
@@ -58,8 +63,9 @@ def residual_dependences(features: Features, predicted: list[Array]) -> tuple[De
     return _dependences(residuals, states, signal)
 
 
-def _dependences(residuals: Mapping[str, list[Array]], states: Mapping[str, list[Array]],
-                signal: str) -> tuple[Dependence, ...]:
+def _dependences(
+    residuals: Mapping[str, list[Array]], states: Mapping[str, list[Array]], signal: str
+) -> tuple[Dependence, ...]:
     """Shares of one signal's residual, largest first.
 
     residuals  signal -> per condition block (n, p) measured - model
@@ -69,8 +75,9 @@ def _dependences(residuals: Mapping[str, list[Array]], states: Mapping[str, list
     out = []
     for variable in VARIABLES:
         if variable == "time":
-            values = np.concatenate([np.repeat(np.linspace(0.0, 1.0, a.shape[0]), a.shape[1])
-                                     for a in residuals[signal]])
+            values = np.concatenate(
+                [np.repeat(np.linspace(0.0, 1.0, a.shape[0]), a.shape[1]) for a in residuals[signal]]
+            )
             target = np.concatenate([a.ravel() for a in residuals[signal]])
         else:
             values = np.concatenate([a.mean(axis=0) for a in states[variable]])

@@ -44,7 +44,10 @@ WIDE = (4, 3)
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """Value and 95 % interval; identified is False where the value lies on its bound or the interval spans the range."""
+    """Value and 95 % interval.
+
+    Identified is False where the value lies on its bound or the interval spans the range.
+    """
 
     value: float
     low: float
@@ -67,8 +70,13 @@ class FoundEffect:
     why: str
 
     def to_dict(self) -> dict[str, Any]:
-        return {"name": self.name, "title": self.title, "source": self.source, "why": self.why,
-                "parameters": {n: p.to_dict() for n, p in self.parameters.items()}}
+        return {
+            "name": self.name,
+            "title": self.title,
+            "source": self.source,
+            "why": self.why,
+            "parameters": {n: p.to_dict() for n, p in self.parameters.items()},
+        }
 
 
 @dataclass(frozen=True)
@@ -83,8 +91,13 @@ class Fall:
     signals: tuple[SignalError, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        return {"added": self.added, "train": self.train, "held_out": self.held_out,
-                "by_condition": dict(self.by_condition), "signals": [s.to_dict() for s in self.signals]}
+        return {
+            "added": self.added,
+            "train": self.train,
+            "held_out": self.held_out,
+            "by_condition": dict(self.by_condition),
+            "signals": [s.to_dict() for s in self.signals],
+        }
 
 
 @dataclass(frozen=True)
@@ -123,21 +136,34 @@ class Diagnosis:
     def to_dict(self) -> dict[str, Any]:
         falls = self.falls
         return {
-            "verdict": self.verdict, "summary": self.summary, "effects": [e.to_dict() for e in self.effects],
-            "tied": [list(names) for names in self.tied], "experiments": [e.to_dict() for e in self.experiments],
-            "error": {"nominal": falls[0].held_out, "final": falls[-1].held_out, "repeatability": 1.0,
-                      "held_out": True, "unit": "multiples of the repeatability between closures"},
-            "falls": [f.to_dict() for f in falls], "ranking": [r.to_dict() for r in self.ranking],
+            "verdict": self.verdict,
+            "summary": self.summary,
+            "effects": [e.to_dict() for e in self.effects],
+            "tied": [list(names) for names in self.tied],
+            "experiments": [e.to_dict() for e in self.experiments],
+            "error": {
+                "nominal": falls[0].held_out,
+                "final": falls[-1].held_out,
+                "repeatability": 1.0,
+                "held_out": True,
+                "unit": "multiples of the repeatability between closures",
+            },
+            "falls": [f.to_dict() for f in falls],
+            "ranking": [r.to_dict() for r in self.ranking],
             "depends_on": {d.variable: d.to_dict() for d in self.depends_on},
-            "chance": self.chance.__dict__.copy(), "costs": dict(self.costs),
-            "nuisances": {n: dict(v) for n, v in self.nuisances.items()}, "notes": list(self.notes),
-            "simulations": self.simulations, "data": [dict(d) for d in self.data],
+            "chance": self.chance.__dict__.copy(),
+            "costs": dict(self.costs),
+            "nuisances": {n: dict(v) for n, v in self.nuisances.items()},
+            "notes": list(self.notes),
+            "simulations": self.simulations,
+            "data": [dict(d) for d in self.data],
             "model": {"name": self.model.name, "sha256": self.model.sha256},
         }
 
 
-def effect_sources(extra: Sequence[str] = (), *, only: Sequence[str] | None = None, model: Model | None = None
-                   ) -> dict[str, str]:
+def effect_sources(
+    extra: Sequence[str] = (), *, only: Sequence[str] | None = None, model: Model | None = None
+) -> dict[str, str]:
     """Effects to consider by name: the catalogue (or `only`) and the user's own, without those the model has."""
     names = list(only) if only is not None else list(catalogue())
     out = {load_effect(given).name: given for given in (*names, *extra)}
@@ -145,14 +171,28 @@ def effect_sources(extra: Sequence[str] = (), *, only: Sequence[str] | None = No
     return {name: given for name, given in out.items() if name not in have}
 
 
-def diagnose(prepared: Prepared, sources: Mapping[str, str], *, jobs: int = 1, progress: Progress = silent,
-             max_effects: int = MAX_EFFECTS) -> Diagnosis:
+def diagnose(
+    prepared: Prepared,
+    sources: Mapping[str, str],
+    *,
+    jobs: int = 1,
+    progress: Progress = silent,
+    max_effects: int = MAX_EFFECTS,
+) -> Diagnosis:
     """Search the catalogue; see the module docstrings of search, chance and problem for the method."""
-    search = Search(prepared.problem, prepared.model, prepared.nuisances, sources, jobs=jobs, progress=progress)
+    search = Search(
+        prepared.problem, prepared.model, prepared.nuisances, sources, jobs=jobs, progress=progress
+    )
     null = search.null()
     limits = chance(search.problem, null.fit, search.signatures(null))
     choice = _choose(search, null, limits, max_effects)
-    search, best, limits, adequate, ranking = choice.search, choice.best, choice.limits, choice.adequate, choice.ranking
+    search, best, limits, adequate, ranking = (
+        choice.search,
+        choice.best,
+        choice.limits,
+        choice.adequate,
+        choice.ranking,
+    )
     prepared = replace(prepared, problem=search.problem)
     nothing = not best.names and adequate
     verdict = "nothing" if nothing else "effects" if adequate else "unknown"
@@ -160,16 +200,31 @@ def diagnose(prepared: Prepared, sources: Mapping[str, str], *, jobs: int = 1, p
     model = fitted_model(prepared.model, search, best) if best.names else prepared.model
     falls = error_falls(prepared, search, best, progress)
     effects = found_effects(search, best, limits, falls)
-    experiments = (separating_experiments(prepared, search, [search.found[tuple(sorted(n))] for n in tied])
-                   if len(tied) > 1 else ())
+    experiments = (
+        separating_experiments(prepared, search, [search.found[tuple(sorted(n))] for n in tied])
+        if len(tied) > 1
+        else ()
+    )
     return Diagnosis(
-        verdict=verdict, summary=_summary(verdict, effects, tied, falls, limits, best), effects=effects, tied=tied,
-        experiments=experiments, falls=falls, ranking=ranking, depends_on=residual_dependences(prepared.features, prepared.features.closures(
-            prepared.rig, best.fit.model, best.fit.values)), chance=limits,
+        verdict=verdict,
+        summary=_summary(verdict, effects, tied, falls, limits, best),
+        effects=effects,
+        tied=tied,
+        experiments=experiments,
+        falls=falls,
+        ranking=ranking,
+        depends_on=residual_dependences(
+            prepared.features, prepared.features.closures(prepared.rig, best.fit.model, best.fit.values)
+        ),
+        chance=limits,
         costs={"nominal_fitted": null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
-        nuisances=_nuisance_table(best.fit), notes=(*prepared.notes, *_identifiability_notes(best)),
-        simulations=prepared.problem.simulations, data=data_used(prepared.features), model=model,
-        values=best.fit.values)
+        nuisances=_nuisance_table(best.fit),
+        notes=(*prepared.notes, *_identifiability_notes(best)),
+        simulations=prepared.problem.simulations,
+        data=data_used(prepared.features),
+        model=model,
+        values=best.fit.values,
+    )
 
 
 @dataclass(frozen=True)
@@ -208,7 +263,7 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
             choice = replace(choice, ranking=ranking)
             break
         new = choice.search.renewed(round_[0])
-        front = [new.refit(c) for c in round_[:WIDE[min(size - 1, len(WIDE) - 1)]]]
+        front = [new.refit(c) for c in round_[: WIDE[min(size - 1, len(WIDE) - 1)]]]
         front.sort(key=lambda c: c.penalised)
         best = new.polish(front[0])
         limits_new = chance(new.problem, best.fit, new.signatures(best))
@@ -244,13 +299,19 @@ def fitted_model(model: Model, search: Search, best: Candidate) -> Model:
     return replace(out, plant=model.plant)
 
 
-def _entry(search: Search, name: str, values: Mapping[str, float], intervals: Mapping[str, tuple[float, float]]
-           ) -> EffectEntry:
+def _entry(
+    search: Search, name: str, values: Mapping[str, float], intervals: Mapping[str, tuple[float, float]]
+) -> EffectEntry:
     kind = search.effect(name)
     own = {p.name: values[f"{name}.{p.name}"] for p in kind.parameters}
     spans = {p.name: intervals[f"{name}.{p.name}"] for p in kind.parameters}
-    return kind.entry(own, source=effect_source(kind, search.sources[name]), status="identified",
-                      where="fitted by hannes; bounds are the 95 % interval", intervals=spans)
+    return kind.entry(
+        own,
+        source=effect_source(kind, search.sources[name]),
+        status="identified",
+        where="fitted by hannes; bounds are the 95 % interval",
+        intervals=spans,
+    )
 
 
 def intervals_of(found: Fit, inflate: float) -> dict[str, tuple[float, float]]:
@@ -273,28 +334,41 @@ def _found(search: Search, best: Candidate, name: str, limits: Chance, falls: Se
         low, high = intervals[f"{name}.{p.name}"]
         span = p.upper - p.lower
         on_bound = min(value - p.lower, p.upper - value) < 1e-6 * span and p.vanishing != value
-        parameters[p.name] = ParameterEstimate(value, low, high, p.unit, not on_bound and high - low < 0.8 * span)
+        parameters[p.name] = ParameterEstimate(
+            value, low, high, p.unit, not on_bound and high - low < 0.8 * span
+        )
     step = next((k for k, f in enumerate(falls) if f.added == name), len(falls) - 1)
     before = {(s.condition, s.signal): s for s in falls[step - 1].signals}
     drops = sorted(falls[step].signals, key=lambda s: s.ratio - before[(s.condition, s.signal)].ratio)
     s = drops[0]
     b = before[(s.condition, s.signal)]
-    why = (f"Without it the model misses {s.signal} in '{s.condition}' by {b.rmse:.3g} {s.unit} ({b.ratio:.1f} times the "
-           f"repeatability), with it by {s.rmse:.3g} {s.unit} ({s.ratio:.2f} times). What it looks like: "
-           f"{kind.looks_like}.")
+    why = (
+        f"Without it the model misses {s.signal} in '{s.condition}' by {b.rmse:.3g} {s.unit} ({b.ratio:.1f} times the "
+        f"repeatability), with it by {s.rmse:.3g} {s.unit} ({s.ratio:.2f} times). What it looks like: "
+        f"{kind.looks_like}."
+    )
     return FoundEffect(name, kind.title, effect_source(kind, search.sources[name]), parameters, why)
 
 
-def found_effects(search: Search, best: Candidate, limits: Chance, falls: Sequence[Fall]) -> tuple[FoundEffect, ...]:
+def found_effects(
+    search: Search, best: Candidate, limits: Chance, falls: Sequence[Fall]
+) -> tuple[FoundEffect, ...]:
     """The effects of a fitted set with parameters, intervals and the reason."""
     return tuple(_found(search, best, name, limits, falls) for name in best.names)
 
 
 def problem_builder(prepared: Prepared, values: Mapping[str, float]) -> Any:
     """A function from Features to a Problem with noise estimated on those features."""
+
     def build(features: Features) -> Problem:
-        return build_problem(prepared.rig, features, prepared.model, prepared.nuisances,
-                             {n.name: values.get(n.name, n.mean) for n in prepared.nuisances})
+        return build_problem(
+            prepared.rig,
+            features,
+            prepared.model,
+            prepared.nuisances,
+            {n.name: values.get(n.name, n.mean) for n in prepared.nuisances},
+        )
+
     return build
 
 
@@ -303,14 +377,24 @@ def error_falls(prepared: Prepared, search: Search, best: Candidate, progress: P
     problem, features = prepared.problem, prepared.features
     build = problem_builder(prepared, best.fit.values)
     nominal = signal_errors(features, features.closures(prepared.rig, prepared.model, {}))
-    falls = [Fall("nominal, as given", overall(nominal), overall(nominal),
-                  {c: overall([e for e in nominal if e.condition == c]) for c in features.conditions}, nominal)]
+    falls = [
+        Fall(
+            "nominal, as given",
+            overall(nominal),
+            overall(nominal),
+            {c: overall([e for e in nominal if e.condition == c]) for c in features.conditions},
+            nominal,
+        )
+    ]
     steps: list[tuple[str, Candidate]] = [("nominal, fitted", search.null())]
     chain: tuple[str, ...] = ()
     left = list(best.names)
     while left:
-        options = [search.found.get(tuple(sorted((*chain, name)))) or search.add(search.found[tuple(sorted(chain))], name)
-                   for name in left]
+        options = [
+            search.found.get(tuple(sorted((*chain, name))))
+            or search.add(search.found[tuple(sorted(chain))], name)
+            for name in left
+        ]
         pick = min(range(len(left)), key=lambda k: options[k].penalised) if len(left) > 1 else 0
         chain = (*chain, left[pick])
         steps.append((left.pop(pick), options[pick]))
@@ -326,9 +410,17 @@ def error_falls(prepared: Prepared, search: Search, best: Candidate, progress: P
 
 def _nuisance_table(found: Fit) -> dict[str, dict[str, float]]:
     intervals = intervals_of(found, 1.0)
-    return {c.name: {"value": c.value(float(z)), "nominal": c.value(0.0), "prior_sds": float(z),
-                     "low": intervals[c.name][0], "high": intervals[c.name][1]}
-            for c, z in zip(found.coordinates, found.z, strict=True) if c.prior}
+    return {
+        c.name: {
+            "value": c.value(float(z)),
+            "nominal": c.value(0.0),
+            "prior_sds": float(z),
+            "low": intervals[c.name][0],
+            "high": intervals[c.name][1],
+        }
+        for c, z in zip(found.coordinates, found.z, strict=True)
+        if c.prior
+    }
 
 
 def _identifiability_notes(best: Candidate) -> list[str]:
@@ -341,23 +433,37 @@ def _identifiability_notes(best: Candidate) -> list[str]:
         for j in range(i):
             b = best.fit.coordinates[j]
             if not (a.prior and b.prior) and abs(correlation[i, j]) > 0.97:
-                notes.append(f"{a.name} and {b.name} cannot be told apart well with these data "
-                             f"(correlation {correlation[i, j]:+.3f})")
+                notes.append(
+                    f"{a.name} and {b.name} cannot be told apart well with these data "
+                    f"(correlation {correlation[i, j]:+.3f})"
+                )
     far = [c.name for c, z in zip(best.fit.coordinates, best.fit.z, strict=True) if c.prior and abs(z) > 4.0]
     if far:
-        notes.append(f"{', '.join(far)} had to move by more than four standard deviations of what is usual: is the "
-                     "nominal model that of this hand?")
+        notes.append(
+            f"{', '.join(far)} had to move by more than four standard deviations of what is usual: is the "
+            "nominal model that of this hand?"
+        )
     return notes
 
 
-def _summary(verdict: str, effects: Sequence[FoundEffect], tied: Sequence[Sequence[str]], falls: Sequence[Fall],
-             limits: Chance, best: Candidate) -> str:
-    fall = (f"The error on held-out closures falls from {falls[1].held_out:.2f} (nominal, fitted) to "
-            f"{falls[-1].held_out:.2f} times the repeatability.")
+def _summary(
+    verdict: str,
+    effects: Sequence[FoundEffect],
+    tied: Sequence[Sequence[str]],
+    falls: Sequence[Fall],
+    limits: Chance,
+    best: Candidate,
+) -> str:
+    fall = (
+        f"The error on held-out closures falls from {falls[1].held_out:.2f} (nominal, fitted) to "
+        f"{falls[-1].held_out:.2f} times the repeatability."
+    )
     if verdict == "nothing":
-        return (f"Nothing is missing: with its own parameters fitted, the model's misfit {best.fit.cost:.0f} is below what "
-                f"chance reaches ({limits.misfit:.0f}), and no effect of the catalogue gains more than chance would. "
-                f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability.")
+        return (
+            f"Nothing is missing: with its own parameters fitted, the model's misfit {best.fit.cost:.0f} is below what "
+            f"chance reaches ({limits.misfit:.0f}), and no effect of the catalogue gains more than chance would. "
+            f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability."
+        )
     names = " and ".join(e.title for e in effects)
     if verdict == "effects":
         tie = ""
@@ -366,5 +472,7 @@ def _summary(verdict: str, effects: Sequence[FoundEffect], tied: Sequence[Sequen
             tie = f" With these data it ties with: {others}."
         return f"Missing: {names}. {fall}{tie}"
     part = f" The catalogue comes nearest with {names}, which is not enough." if names else ""
-    return (f"Something is missing that is not in the catalogue: the best model's misfit {best.fit.cost:.0f} stays above "
-            f"what chance reaches ({limits.misfit:.0f}).{part} {fall}")
+    return (
+        f"Something is missing that is not in the catalogue: the best model's misfit {best.fit.cost:.0f} stays above "
+        f"what chance reaches ({limits.misfit:.0f}).{part} {fall}"
+    )

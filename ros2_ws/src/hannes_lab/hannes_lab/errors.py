@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 from .features import Block, Features
 from .fit import fit
 from .problem import Coordinate, Problem
-from .rig import Rig
 
 Array = NDArray[np.float64]
 
-UNITS = {"encoder_position": "rad", "motor_current": "A", "motor_voltage": "V", "grip_force": "N",
-         "motor_effort": "N.m"}
+UNITS = {
+    "encoder_position": "rad",
+    "motor_current": "A",
+    "motor_voltage": "V",
+    "grip_force": "N",
+    "motor_effort": "N.m",
+}
 
 
 @dataclass(frozen=True)
@@ -49,15 +53,27 @@ def repeatability(block: Block) -> float:
     return float(np.sqrt((e**2).sum(axis=0).mean() / (block.n - 1)))
 
 
-def signal_errors(features: Features, closures: Sequence[Array], floor: Sequence[float] | None = None
-                  ) -> tuple[SignalError, ...]:
-    """Errors of predicted closures, one per block; `floor` replaces the repeatability (held-out parts are too small)."""
+def signal_errors(
+    features: Features, closures: Sequence[Array], floor: Sequence[float] | None = None
+) -> tuple[SignalError, ...]:
+    """Errors of predicted closures, one per block.
+
+    `floor` replaces the repeatability (held-out parts are too small).
+    """
     out = []
     for k, (block, predicted) in enumerate(zip(features.blocks, closures, strict=True)):
         rmse = float(np.sqrt(((block.measured - predicted) ** 2).mean()))
         repeat = repeatability(block) if floor is None else floor[k]
-        out.append(SignalError(block.condition, block.signal, UNITS.get(block.signal, ""), rmse, repeat,
-                               rmse / repeat if repeat > 0 else float("nan")))
+        out.append(
+            SignalError(
+                block.condition,
+                block.signal,
+                UNITS.get(block.signal, ""),
+                rmse,
+                repeat,
+                rmse / repeat if repeat > 0 else float("nan"),
+            )
+        )
     return tuple(out)
 
 
@@ -69,6 +85,7 @@ def overall(errors: Sequence[SignalError]) -> float:
 
 def split_closures(features: Features) -> tuple[Features, Features]:
     """Training and held-out closures: every second closure of each block is held out."""
+
     def part(first: int) -> Features:
         blocks = []
         for block in features.blocks:
@@ -77,19 +94,19 @@ def split_closures(features: Features) -> tuple[Features, Features]:
             def cut(index: tuple[Any, ...] | None, chosen: slice = pick) -> Any:
                 return None if index is None else tuple(a[chosen] for a in index)
 
-            blocks.append(replace(block, measured=block.measured[pick], full=cut(block.full),
-                                  compact=cut(block.compact)))
+            blocks.append(
+                replace(
+                    block, measured=block.measured[pick], full=cut(block.full), compact=cut(block.compact)
+                )
+            )
         return replace(features, blocks=tuple(blocks), slices=())
 
     return part(0), part(1)
 
 
-def closures_at(rig: Rig, features: Features, model: Model, values: Mapping[str, float]) -> list[Array]:
-    return features.closures(rig, model, values)
-
-
-def held_out_closures(problem_of: Any, features: Features, model: Model, coordinates: Sequence[Coordinate], start: Array
-                      ) -> tuple[float, float]:
+def held_out_closures(
+    problem_of: Any, features: Features, model: Model, coordinates: Sequence[Coordinate], start: Array
+) -> tuple[float, float]:
     """(training, held-out) overall error after a refit on the training closures only.
 
     problem_of   builds a Problem from Features (noise and scatter are estimated on the training closures alone)
@@ -103,8 +120,9 @@ def held_out_closures(problem_of: Any, features: Features, model: Model, coordin
     return overall(inside), overall(outside)
 
 
-def held_out_conditions(problem: Problem, model: Model, coordinates: Sequence[Coordinate], start: Array
-                        ) -> dict[str, float]:
+def held_out_conditions(
+    problem: Problem, model: Model, coordinates: Sequence[Coordinate], start: Array
+) -> dict[str, float]:
     """Overall error on each condition when it took no part in the fit.
 
     Parameters of the held-out recording alone (its object, its encoder zero: `name@condition`) cannot be known from the

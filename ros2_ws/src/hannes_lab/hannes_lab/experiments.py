@@ -35,11 +35,17 @@ class Experiment:
     separates: tuple[tuple[str, ...], ...]
 
     def to_dict(self) -> dict[str, Any]:
-        return {"name": self.name, "profile": self.profile, "options": dict(self.options), "object": self.grasp,
-                "distance": self.distance, "separates": [list(n) for n in self.separates],
-                "command": f"hannes record --profile {self.profile} "
-                           + " ".join(f"--option {k}={v:g}" for k, v in self.options.items())
-                           + f" --object {self.grasp} --closures 13 --out bags/{self.name}"}
+        return {
+            "name": self.name,
+            "profile": self.profile,
+            "options": dict(self.options),
+            "object": self.grasp,
+            "distance": self.distance,
+            "separates": [list(n) for n in self.separates],
+            "command": f"hannes record bags/{self.name} --condition {self.name} --object {self.grasp} "
+            f"--profile {self.profile} --closures 13"
+            + "".join(f" --{k} {v:g}" for k, v in self.options.items()),
+        }
 
 
 CANDIDATES: tuple[tuple[str, str, dict[str, float], str], ...] = (
@@ -47,16 +53,17 @@ CANDIDATES: tuple[tuple[str, str, dict[str, float], str], ...] = (
     ("fast_void", "half_sine", {"period": 1.5}, "none"),
     ("small_void", "half_sine", {"period": 3.0, "amplitude": 5.0}, "none"),
     ("reversals_void", "reversals", {"period": 8.0}, "none"),
-    ("hold_rigid", "ramp_hold", {"hold": 2.0}, "rigid"),
-    ("hold_soft", "ramp_hold", {"hold": 2.0}, "soft"),
+    ("hold_rigid", "ramp_hold", {"period": 6.0}, "rigid"),
+    ("hold_soft", "ramp_hold", {"period": 6.0}, "soft"),
     ("fast_soft", "half_sine", {"period": 1.8}, "soft"),
     ("reversals_rigid", "reversals", {"period": 8.0}, "rigid"),
 )
 """Candidate conditions: name, profile, options, object."""
 
 
-def separating_experiments(prepared: Prepared, search: Search, tied: Sequence[Candidate], keep: int = 3
-                           ) -> tuple[Experiment, ...]:
+def separating_experiments(
+    prepared: Prepared, search: Search, tied: Sequence[Candidate], keep: int = 3
+) -> tuple[Experiment, ...]:
     """The candidate conditions that separate the tied models best.
 
     Each model predicts one closure with its fitted parameters; differences count in units of the sensors' noise and
@@ -73,9 +80,12 @@ def separating_experiments(prepared: Prepared, search: Search, tied: Sequence[Ca
         for a, b in itertools.combinations(range(len(tied)), 2):
             d = predictions[a] - predictions[b]
             reduced = d - sensitivity @ np.linalg.solve(
-                sensitivity.T @ sensitivity + np.eye(sensitivity.shape[1]), sensitivity.T @ d)
-            distances.append(float(np.sqrt(max(d @ reduced, 0.0))))
-        out.append(Experiment(name, profile, dict(options), grasp, min(distances), tuple(c.names for c in tied)))
+                sensitivity.T @ sensitivity + np.eye(sensitivity.shape[1]), sensitivity.T @ d
+            )
+            distances.append(float(np.sqrt(max(float(d @ reduced), 0.0))))
+        out.append(
+            Experiment(name, profile, dict(options), grasp, min(distances), tuple(c.names for c in tied))
+        )
     return tuple(sorted(out, key=lambda e: -e.distance)[:keep])
 
 
@@ -95,16 +105,27 @@ def _trial(like: Trial, name: str, profile: str, options: dict[str, float], gras
     return Trial(name, like.period, reference, like.signals, like.closures, meta)
 
 
-def _predict(prepared: Prepared, candidate: Candidate, trial: Trial, noise: dict[str, float],
-             values: dict[str, float] | None = None) -> Array:
+def _predict(
+    prepared: Prepared,
+    candidate: Candidate,
+    trial: Trial,
+    noise: dict[str, float],
+    values: dict[str, float] | None = None,
+) -> Array:
     rig = type(prepared.rig)([trial])  # type: ignore[call-arg]
-    run = rig.simulate(candidate.fit.model, {n: v for n, v in (values or candidate.fit.values).items() if "@" not in n},
-                       trial, trial.reference)
+    run = rig.simulate(
+        candidate.fit.model,
+        {n: v for n, v in (values or candidate.fit.values).items() if "@" not in n},
+        trial,
+        trial.reference,
+    )
     every = max(1, round(1.0 / 30.0 / trial.period))
     return np.concatenate([run[signal][::every] / sd for signal, sd in noise.items()])
 
 
-def _sensitivity(prepared: Prepared, candidate: Candidate, trial: Trial, noise: dict[str, float], base: Array) -> Array:
+def _sensitivity(
+    prepared: Prepared, candidate: Candidate, trial: Trial, noise: dict[str, float], base: Array
+) -> Array:
     columns = []
     for c in candidate.fit.coordinates:
         if c.prior and "@" not in c.name:

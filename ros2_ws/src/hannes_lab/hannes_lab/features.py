@@ -119,7 +119,9 @@ class Features:
             compact = end is not None and not memory
             reference = trial.reference[:end] if compact else trial.reference
             runs.append((rig.simulate(model, values, trial, reference), compact))
-        return [block.predicted(runs[block.trial][0][block.signal], runs[block.trial][1]) for block in self.blocks]
+        return [
+            block.predicted(runs[block.trial][0][block.signal], runs[block.trial][1]) for block in self.blocks
+        ]
 
     def predict(self, rig: Rig, model: Model, values: Mapping[str, float]) -> Array:
         """Features of the model (size,)."""
@@ -144,7 +146,9 @@ def build_features(trials: Sequence[Trial], signals: Sequence[str]) -> Features:
                     if block is not None:
                         blocks.append(block)
     if not blocks:
-        raise HannesError(f"None of the signals {', '.join(signals)} covers a whole closure in these recordings.")
+        raise HannesError(
+            f"None of the signals {', '.join(signals)} covers a whole closure in these recordings."
+        )
     return Features(tuple(trials), tuple(blocks), tuple(ends))
 
 
@@ -155,11 +159,11 @@ def _compact_end(trial: Trial) -> int | None:
     second = trial.closures[1]
     n = round((second.stop - second.start) / trial.period)
     a = round(second.start / trial.period)
-    shape = trial.reference[a:a + n]
+    shape = trial.reference[a : a + n]
     span = float(np.ptp(shape)) or 1.0
     for closure in trial.closures[2:]:
         k = round(closure.start / trial.period)
-        other = trial.reference[k:k + n]
+        other = trial.reference[k : k + n]
         # A fresh reference sample may fall one tick earlier or later from closure to closure.
         if other.size < n or np.mean(np.abs(other - shape)) > 2e-3 * span:
             return None
@@ -194,8 +198,13 @@ def _block(trial: Trial, number: int, condition: str, signal: str, may_compact: 
         full.append((sample_tick[left], sample_tick[right], weight))
         if base is not None and limit is not None:
             shift = 0 if closure is trial.closures[0] else round((base.start - closure.start) / trial.period)
-            compact.append((np.clip(sample_tick[left] + shift, 0, limit - 1),
-                            np.clip(sample_tick[right] + shift, 0, limit - 1), weight))
+            compact.append(
+                (
+                    np.clip(sample_tick[left] + shift, 0, limit - 1),
+                    np.clip(sample_tick[right] + shift, 0, limit - 1),
+                    weight,
+                )
+            )
     if not measured:
         return None
 
@@ -203,11 +212,21 @@ def _block(trial: Trial, number: int, condition: str, signal: str, may_compact: 
         a, b, w = zip(*parts, strict=True)
         return np.array(a), np.array(b), np.array(w)
 
-    return Block(number, condition, signal, phase, np.array(measured), stack(full),
-                 stack(compact) if compact else None)
+    return Block(
+        number, condition, signal, phase, np.array(measured), stack(full), stack(compact) if compact else None
+    )
 
 
 def data_used(features: Features) -> tuple[dict[str, Any], ...]:
     """What data took part: bag, hash, conditions, closures, signals."""
-    return tuple({"name": t.name, "source": t.source, "sha256": t.sha256, "conditions": list(t.conditions),
-                  "closures": len(t.closures), "signals": sorted(t.signals)} for t in features.trials)
+    return tuple(
+        {
+            "name": t.name,
+            "source": t.source,
+            "sha256": t.sha256,
+            "conditions": list(t.conditions),
+            "closures": len(t.closures),
+            "signals": sorted(t.signals),
+        }
+        for t in features.trials
+    )

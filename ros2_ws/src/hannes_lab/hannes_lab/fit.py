@@ -51,12 +51,17 @@ class Fit:
     def covariance(self, inflate: float = 1.0) -> Array:
         """Covariance (k, k) of z from the curvature at the optimum, with the priors; pseudo-inverse where singular."""
         prior = np.diag([1.0 if c.prior else 1e-6 for c in self.coordinates])
-        cov: Array = np.linalg.pinv(self.jacobian.T @ self.jacobian + prior) * inflate
-        return cov
+        return np.asarray(np.linalg.pinv(self.jacobian.T @ self.jacobian + prior) * inflate, dtype=np.float64)
 
 
-def finite_differences(problem: Problem, model: Model, coordinates: Sequence[Coordinate], z: Array, residual: Array,
-                       columns: Sequence[int]) -> Array:
+def finite_differences(
+    problem: Problem,
+    model: Model,
+    coordinates: Sequence[Coordinate],
+    z: Array,
+    residual: Array,
+    columns: Sequence[int],
+) -> Array:
     """Derivatives (size, len(columns)) of the whitened residual, one simulation each; steps stay inside the bounds."""
     out = np.empty((residual.size, len(columns)))
     values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
@@ -73,8 +78,16 @@ def finite_differences(problem: Problem, model: Model, coordinates: Sequence[Coo
     return out
 
 
-def fit(problem: Problem, model: Model, coordinates: Sequence[Coordinate], start: Mapping[str, float] | Array, *,
-        rows: Mask | None = None, known: Mapping[str, Array] | None = None, evaluations: int = 12) -> Fit:
+def fit(
+    problem: Problem,
+    model: Model,
+    coordinates: Sequence[Coordinate],
+    start: Mapping[str, float] | Array,
+    *,
+    rows: Mask | None = None,
+    known: Mapping[str, Array] | None = None,
+    evaluations: int = 12,
+) -> Fit:
     """Least squares over z from `start` (z by name, others 0).
 
     rows         features that take part; None: all
@@ -84,7 +97,11 @@ def fit(problem: Problem, model: Model, coordinates: Sequence[Coordinate], start
     """
     coordinates = tuple(coordinates)
     known = known or {}
-    z0 = np.array([start.get(c.name, 0.0) for c in coordinates]) if isinstance(start, Mapping) else np.array(start)
+    z0 = (
+        np.array([start.get(c.name, 0.0) for c in coordinates])
+        if isinstance(start, Mapping)
+        else np.array(start)
+    )
     bounds = np.array([c.bounds for c in coordinates]).T if coordinates else np.zeros((2, 0))
     priors = np.array([1.0 if c.prior else 0.0 for c in coordinates])
     use = np.ones(problem.features.size, dtype=bool) if rows is None else rows
@@ -95,7 +112,9 @@ def fit(problem: Problem, model: Model, coordinates: Sequence[Coordinate], start
         if key not in cache:
             if len(cache) > 4:
                 cache.clear()
-            cache[key] = problem.residual(model, {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)})
+            cache[key] = problem.residual(
+                model, {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
+            )
         return cache[key]
 
     last: dict[str, Array] = {}
@@ -119,9 +138,17 @@ def fit(problem: Problem, model: Model, coordinates: Sequence[Coordinate], start
         return Fit(model, (), np.zeros(0), float(r[use] @ r[use]), r, np.zeros((r.size, 0)))
     inside = np.clip(z0, bounds[0] + 1e-9, bounds[1] - 1e-9)
     found = least_squares(
-        lambda z: np.concatenate([residual_at(z)[use], priors * z]), inside,
-        jac=lambda z: np.vstack([jacobian_at(z)[use], np.diag(priors)]), bounds=(bounds[0], bounds[1]), method="trf",
-        max_nfev=evaluations, ftol=1e-5, xtol=1e-5, gtol=1e-8, x_scale=1.0)
+        lambda z: np.concatenate([residual_at(z)[use], priors * z]),
+        inside,
+        jac=lambda z: np.vstack([jacobian_at(z)[use], np.diag(priors)]),
+        bounds=(bounds[0], bounds[1]),
+        method="trf",
+        max_nfev=evaluations,
+        ftol=1e-5,
+        xtol=1e-5,
+        gtol=1e-8,
+        x_scale=1.0,
+    )
     z = found.x
     r = residual_at(z)
     jacobian = last["jacobian"] if "z" in last and np.allclose(last["z"], z, atol=0.2) else jacobian_at(z)

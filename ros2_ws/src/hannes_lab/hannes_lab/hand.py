@@ -37,7 +37,9 @@ def object_of(trial: Trial) -> GraspObject | None:
         return named_object(given)
     if isinstance(given, Mapping):
         return GraspObject.from_dict(given)
-    raise HannesError(f"Trial '{trial.name}': 'object' must be a name or a mapping, not {type(given).__name__}.")
+    raise HannesError(
+        f"Trial '{trial.name}': 'object' must be a name or a mapping, not {type(given).__name__}."
+    )
 
 
 def sensors_of(trial: Trial) -> dict[str, Any]:
@@ -45,13 +47,19 @@ def sensors_of(trial: Trial) -> dict[str, Any]:
     given = trial.options.get("sensors")
     if isinstance(given, Mapping):
         sensors = Sensors.from_dict(given)
-        return {"rectified": sensors.current_rectified, "window": sensors.current_window,
-                "noise": sensors.current_noise}
+        return {
+            "rectified": sensors.current_rectified,
+            "window": sensors.current_window,
+            "noise": sensors.current_noise,
+        }
     if "motor_current" not in trial.signals:
         return {"rectified": False, "window": 0.0, "noise": 0.0}
     values = trial.signals["motor_current"][1]
-    return {"rectified": bool(values.min() >= -0.01 * max(values.max(), 1e-9)), "window": 0.0,
-            "noise": sample_noise(values)}
+    return {
+        "rectified": bool(values.min() >= -0.01 * max(values.max(), 1e-9)),
+        "window": 0.0,
+        "noise": sample_noise(values),
+    }
 
 
 class HandRig:
@@ -81,7 +89,9 @@ class HandRig:
                     plant, _, _ = self._plant(model.without_effects(), trial)
                     out.append(Nuisance(f"{name}@{trial.name}", plant.get(name), sd, relative, scatter))
             elif name == "encoder.zero":
-                out += [Nuisance(f"{name}@{trial.name}", 0.0, sd, False, scatter, "rad") for trial in self.trials]
+                out += [
+                    Nuisance(f"{name}@{trial.name}", 0.0, sd, False, scatter, "rad") for trial in self.trials
+                ]
             else:
                 mean = model.parameters.value(name)
                 if mean > 0.0:
@@ -90,23 +100,38 @@ class HandRig:
 
     def _plant(self, model: Model, trial: Trial) -> tuple[Plant, Controller, dict[str, float]]:
         structure = tuple(effect.source or effect.name for effect in model.effects)
-        key = (model.plant, model.controller, model.parameters.sha256, repr(sorted(model.variant.items())), trial.name,
-               *structure)
+        key = (
+            model.plant,
+            model.controller,
+            model.parameters.sha256,
+            repr(sorted(model.variant.items())),
+            trial.name,
+            *structure,
+        )
         if key not in self._plants:
             plant = make_plant(model, object_of(trial))
             plant.set("encoder.resolution", 0.0)
             self._plants[key] = (plant, make_controller(model, trial.period), {})
         return self._plants[key]
 
-    def simulate(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> dict[str, Array]:
+    def simulate(
+        self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
+    ) -> dict[str, Array]:
         """See Rig; the encoder's quantiser is off, so that the signals are smooth in the parameters."""
         run = self.run(model, values, trial, reference)
         logged = self._sensors[trial.name]
-        current = logger(run.motor_current, trial.period, rectified=logged["rectified"], window=logged["window"])
+        current = logger(
+            run.motor_current, trial.period, rectified=logged["rectified"], window=logged["window"]
+        )
         if logged["rectified"]:
             current = folded_mean(current, logged["noise"])
-        return {"encoder_position": run.encoder_position, "motor_current": current, "motor_voltage": run.motor_voltage,
-                "grip_force": run.grip_force, "motor_effort": run.motor_effort}
+        return {
+            "encoder_position": run.encoder_position,
+            "motor_current": current,
+            "motor_voltage": run.motor_voltage,
+            "grip_force": run.grip_force,
+            "motor_effort": run.motor_effort,
+        }
 
     def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
         """The rollout itself, with all that the plant can show."""
@@ -133,5 +158,7 @@ def make_controller(model: Model, period: float) -> Controller:
         file, _, name = model.controller.rpartition(":")
         law: Controller = load_class(file, name, "controller")(model.parameters, period)
         return law
-    raise HannesError(f"Model '{model.name}': unknown controller '{model.controller}'; valid are double_pid, or "
-                      "path.py:Class for your own.")
+    raise HannesError(
+        f"Model '{model.name}': unknown controller '{model.controller}'; valid are double_pid, or "
+        "path.py:Class for your own."
+    )

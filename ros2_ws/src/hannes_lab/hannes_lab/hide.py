@@ -49,14 +49,17 @@ class ConditionSpec:
         return profile[np.arange(profile.size) // hold * hold]
 
 
-CONDITIONS: Mapping[str, ConditionSpec] = {c.name: c for c in (
-    ConditionSpec("slow", 4.0, 13.0, "none"),
-    ConditionSpec("fast", 1.8, 13.0, "none"),
-    ConditionSpec("grasp", 4.0, 13.0, "rigid"),
-    ConditionSpec("grasp_soft", 4.0, 13.0, "soft"),
-    ConditionSpec("grasp_fast", 2.0, 13.0, "soft"),
-    ConditionSpec("creep", 12.0, 13.0, "none"),
-)}
+CONDITIONS: Mapping[str, ConditionSpec] = {
+    c.name: c
+    for c in (
+        ConditionSpec("slow", 4.0, 13.0, "none"),
+        ConditionSpec("fast", 1.8, 13.0, "none"),
+        ConditionSpec("grasp", 4.0, 13.0, "rigid"),
+        ConditionSpec("grasp_soft", 4.0, 13.0, "soft"),
+        ConditionSpec("grasp_fast", 2.0, 13.0, "soft"),
+        ConditionSpec("creep", 12.0, 13.0, "none"),
+    )
+}
 """Conditions by name; the default set is slow, fast, grasp."""
 
 DEFAULT_CONDITIONS = ("slow", "fast", "grasp")
@@ -85,13 +88,25 @@ class Truth:
     plant: str
 
     def to_dict(self) -> dict[str, Any]:
-        return {"seed": self.seed, "plant": self.plant, "effects": [e.to_dict() for e in self.effects],
-                "parameters": dict(self.parameters)}
+        return {
+            "seed": self.seed,
+            "plant": self.plant,
+            "effects": [e.to_dict() for e in self.effects],
+            "parameters": dict(self.parameters),
+        }
 
 
-def make_set(model: Model, effects: Sequence[EffectEntry], *, seed: int, closures: int = 13,
-             conditions: Sequence[str] = DEFAULT_CONDITIONS, sensors: Sensors | str = "thesis", scatter: float = 1.0,
-             spread: float = 1.0) -> tuple[list[Recording], Truth]:
+def make_set(
+    model: Model,
+    effects: Sequence[EffectEntry],
+    *,
+    seed: int,
+    closures: int = 13,
+    conditions: Sequence[str] = DEFAULT_CONDITIONS,
+    sensors: Sensors | str = "thesis",
+    scatter: float = 1.0,
+    spread: float = 1.0,
+) -> tuple[list[Recording], Truth]:
     """Recordings of one hand of the population with hidden effects, and the truth.
 
     scatter, spread  factors on the tolerances of population.yaml from closure to closure, from hand to hand
@@ -111,23 +126,43 @@ def make_set(model: Model, effects: Sequence[EffectEntry], *, seed: int, closure
     rng = np.random.default_rng(seed)
     hand = {name: spread * float(entry["hand_sd"]) * rng.standard_normal() for name, entry in table.items()}
     recordings = [
-        _record(model, CONDITIONS[name], closures, sensors, hand, table, scatter,
-                np.random.default_rng([seed, number + 1]))
+        _record(
+            model,
+            CONDITIONS[name],
+            closures,
+            sensors,
+            hand,
+            table,
+            scatter,
+            np.random.default_rng([seed, number + 1]),
+        )
         for number, name in enumerate(conditions)
     ]
-    truth = {name: (f"x {math.exp(z):.4f}" if table[name]["unit"] == "1" else f"+ {z:.4f} {table[name]['unit']}")
-             for name, z in hand.items()}
+    truth = {
+        name: (f"x {math.exp(z):.4f}" if table[name]["unit"] == "1" else f"+ {z:.4f} {table[name]['unit']}")
+        for name, z in hand.items()
+    }
     return recordings, Truth(tuple(effects), truth, seed, model.plant)  # type: ignore[arg-type]
 
 
-def _record(model: Model, spec: ConditionSpec, closures: int, sensors: Sensors, hand: Mapping[str, float],
-            table: Mapping[str, Mapping[str, Any]], scatter: float, rng: np.random.Generator) -> Recording:
+def _record(
+    model: Model,
+    spec: ConditionSpec,
+    closures: int,
+    sensors: Sensors,
+    hand: Mapping[str, float],
+    table: Mapping[str, Mapping[str, Any]],
+    scatter: float,
+    rng: np.random.Generator,
+) -> Recording:
     plant = make_plant(model, named_object(spec.grasp))
     controller = make_controller(model, 1e-3)
     base = {name: plant.get(name) for name in table if not name.startswith("object.") or spec.grasp != "none"}
     zero = hand.get("encoder.zero", 0.0)
     reference = spec.reference(controller.period, sensors.reference_rate)
-    parts: list[Rollout] = [rollout(plant, controller, np.zeros(round(REST / controller.period)), joints=False)]
+    parts: list[Rollout] = [
+        rollout(plant, controller, np.zeros(round(REST / controller.period)), joints=False)
+    ]
     for _ in range(closures):
         for name, value in base.items():
             entry = table[name]
@@ -137,17 +172,28 @@ def _record(model: Model, spec: ConditionSpec, closures: int, sensors: Sensors, 
             else:
                 plant.set(name, value * math.exp(shift) if entry["unit"] == "1" else value + shift)
         parts.append(rollout(plant, controller, reference, reset=False, joints=False))
-    run = Rollout(np.concatenate([p.time for p in parts]), np.concatenate([p.reference_position for p in parts]),
-                  np.concatenate([p.motor_voltage for p in parts]), np.concatenate([p.raw for p in parts]))
+    run = Rollout(
+        np.concatenate([p.time for p in parts]),
+        np.concatenate([p.reference_position for p in parts]),
+        np.concatenate([p.motor_voltage for p in parts]),
+        np.concatenate([p.raw for p in parts]),
+    )
     samples = sensors.sample(run, rng)
     channels = {}
     for name, (time, values) in samples.items():
         channels[name] = Channel(time, values, SIGNALS[name].unit, name)
-    metadata = {"condition": spec.name, "closures": closures, "object": spec.grasp, "sensors": sensors.to_dict()}
+    metadata = {
+        "condition": spec.name,
+        "closures": closures,
+        "object": spec.grasp,
+        "sensors": sensors.to_dict(),
+    }
     return Recording(channels, metadata, spec.name)
 
 
-def write_set(recordings: Sequence[Recording], truth: Truth, folder: str | Path, truth_file: str | Path) -> list[Path]:
+def write_set(
+    recordings: Sequence[Recording], truth: Truth, folder: str | Path, truth_file: str | Path
+) -> list[Path]:
     """One bag per condition below `folder`; the truth in a file outside the bags."""
     folder, truth_file = Path(folder), Path(truth_file)
     if truth_file.exists():

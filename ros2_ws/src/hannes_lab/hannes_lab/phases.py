@@ -10,22 +10,30 @@ from .trials import Closure, Trial
 Array = NDArray[np.float64]
 
 PHASES = ("void", "grasp", "hold", "opening", "rest")
-"""void: closing without contact; grasp: closing in contact; hold: the reference stands away from rest; opening; rest."""
+"""void: closing without contact.
+
+Grasp: closing in contact; hold: the reference stands away from rest; opening; rest.
+"""
 
 TRANSIENT = 0.15
 """s after the start that the thesis' averages leave out (X18: the start-up transient of the current)."""
 
 
-def phase_of(trial: Trial, closure: Closure, phase: Array, contact: Array | None) -> NDArray[np.int64]:
+def phase_of(
+    trial: Trial, closure: Closure, phase: Array, contact: NDArray[np.bool_] | None
+) -> NDArray[np.int64]:
     """Index into PHASES for every instant `phase` (p,) [s since the closure's start].
 
-    From the reference alone: rising, standing or falling; `contact` (p,) of bool tells grasp from void (None: no object).
+    From the reference alone: rising, standing or falling; `contact` (p,) of bool tells grasp from void (None: no
+    object).
     """
     time = np.arange(trial.reference.size) * trial.period
     at = closure.start + phase
     half = max(5.0 * trial.period, 0.02)
     reference = np.interp(at, time, trial.reference)
-    slope = (np.interp(at + half, time, trial.reference) - np.interp(at - half, time, trial.reference)) / (2.0 * half)
+    slope = (np.interp(at + half, time, trial.reference) - np.interp(at - half, time, trial.reference)) / (
+        2.0 * half
+    )
     inside = (time >= closure.start) & (time <= closure.stop)
     low, high = float(trial.reference[inside].min()), float(trial.reference[inside].max())
     span = max(high - low, 1e-12)
@@ -42,14 +50,24 @@ def phase_of(trial: Trial, closure: Closure, phase: Array, contact: Array | None
 
 
 METRICS = {
-    "closure_time": "s", "average_closing_current": "A", "slope_closing_current": "A/s", "maximum_current": "A",
-    "average_opening_current": "A", "slope_opening_current": "A/s", "maximum_grip_force": "N",
+    "closure_time": "s",
+    "average_closing_current": "A",
+    "slope_closing_current": "A/s",
+    "maximum_current": "A",
+    "average_opening_current": "A",
+    "slope_opening_current": "A/s",
+    "maximum_grip_force": "N",
 }
 """The thesis' figures (R05, R07-R13) and their units."""
 
 
-def metrics(phase: Array, labels: NDArray[np.int64], position: Array | None, current: Array | None,
-            force: Array | None) -> dict[str, float]:
+def metrics(
+    phase: Array,
+    labels: NDArray[np.int64],
+    position: Array | None,
+    current: Array | None,
+    force: Array | None,
+) -> dict[str, float]:
     """Figures of one closure (p,); NaN where a signal or a phase is not there.
 
     closure_time             from the start until the encoder has made 95 % of its travel
@@ -66,7 +84,9 @@ def metrics(phase: Array, labels: NDArray[np.int64], position: Array | None, cur
         top = float(travel.max())
         if top > 0.0:
             k = int(np.argmax(travel >= 0.95 * top))
-            out["closure_time"] = float(np.interp(0.95 * top, travel[max(k - 1, 0):k + 1], phase[max(k - 1, 0):k + 1]))
+            out["closure_time"] = float(
+                np.interp(0.95 * top, travel[max(k - 1, 0) : k + 1], phase[max(k - 1, 0) : k + 1])
+            )
     if current is not None:
         i = np.abs(current)
         settled = phase >= TRANSIENT
@@ -85,7 +105,9 @@ def metrics(phase: Array, labels: NDArray[np.int64], position: Array | None, cur
             tail = index[index >= low]
             out["average_opening_current"] = float(i[tail].mean())
             if grasp.any():
-                peak = int(np.argmax(np.where(grasp | opening | (labels == PHASES.index("hold")), i, -np.inf)))
+                peak = int(
+                    np.argmax(np.where(grasp | opening | (labels == PHASES.index("hold")), i, -np.inf))
+                )
                 out["slope_opening_current"] = _slope(phase, i, np.arange(peak, low + 1), rising=False)
     if force is not None:
         out["maximum_grip_force"] = float(force.max())

@@ -17,7 +17,7 @@ from .fit import fit
 from .hand import HandRig
 from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, Rig
-from .trials import SIGNALS, Trial, make_trial, unique_names
+from .trials import SIGNALS, Closure, Trial, make_trial, unique_names
 
 OUTLIER = 6.0
 """A closure whose distance from the median closure exceeds this multiple of the median distance is left out."""
@@ -43,9 +43,13 @@ def find_bags(paths: Sequence[str | Path]) -> list[Path]:
         if not path.exists():
             raise HannesError(f"No bag '{given}': the path does not exist.")
         if path.is_dir() and not (path / "metadata.yaml").exists() and not _storage(path):
-            below = sorted(p for p in path.iterdir() if p.is_dir() and ((p / "metadata.yaml").exists() or _storage(p)))
+            below = sorted(
+                p for p in path.iterdir() if p.is_dir() and ((p / "metadata.yaml").exists() or _storage(p))
+            )
             if not below:
-                raise HannesError(f"'{given}' holds no bag: a bag is a folder with metadata.yaml and .mcap or .db3 files.")
+                raise HannesError(
+                    f"'{given}' holds no bag: a bag is a folder with metadata.yaml and .mcap or .db3 files."
+                )
             out += below
         else:
             out.append(path)
@@ -68,7 +72,8 @@ def load_trials(paths: Sequence[str | Path], signals: Sequence[str] = SIGNALS) -
 
 def without_outliers(trial: Trial) -> Trial:
     """Leave out closures that are far from the others of their condition (at least five closures needed)."""
-    kept, dropped = [], []
+    kept: list[Closure] = []
+    dropped: list[Closure] = []
     for condition in trial.conditions:
         closures = trial.of(condition)
         if len(closures) < 5:
@@ -80,18 +85,22 @@ def without_outliers(trial: Trial) -> Trial:
             grid = np.linspace(0.02 * length, 0.95 * length, 60)
             curves = np.array([np.interp(c.start + grid, time, values) for c in closures])
             away = np.sqrt(((curves - np.median(curves, axis=0)) ** 2).mean(axis=1))
-            distance = np.maximum(distance, away / max(float(np.median(away)), 1e-3 * float(np.ptp(curves)), 1e-12))
+            distance = np.maximum(
+                distance, away / max(float(np.median(away)), 1e-3 * float(np.ptp(curves)), 1e-12)
+            )
         for closure, far in zip(closures, distance, strict=True):
             (dropped if far > OUTLIER else kept).append(closure)
     if not dropped:
         return trial
-    note = (f"{len(dropped)} closure(s) far from the others are left out, starting at "
-            + ", ".join(f"{c.start:.1f} s" for c in dropped))
+    note = f"{len(dropped)} closure(s) far from the others are left out, starting at " + ", ".join(
+        f"{c.start:.1f} s" for c in dropped
+    )
     return replace(trial, closures=tuple(sorted(kept, key=lambda c: c.start)), notes=(*trial.notes, note))
 
 
-def prepare(trials: Sequence[Trial], model: Model, *, rig: Rig | None = None, signals: Sequence[str] | None = None
-            ) -> Prepared:
+def prepare(
+    trials: Sequence[Trial], model: Model, *, rig: Rig | None = None, signals: Sequence[str] | None = None
+) -> Prepared:
     """Estimate noise and scatter at the fitted nominal model.
 
     rig      another machine's rig; the hand's if None
@@ -110,13 +119,18 @@ def prepare(trials: Sequence[Trial], model: Model, *, rig: Rig | None = None, si
     problem.simulations = sims
     notes = [f"{trial.name}: {note}" for trial in trials for note in trial.notes]
     if len(features.conditions) < 2:
-        notes.append("there is one condition only: what fits it may fail elsewhere; record another speed and a grasp")
+        notes.append(
+            "there is one condition only: what fits it may fail elsewhere; record another speed and a grasp"
+        )
     if "motor_current" not in present and "motor_effort" not in present:
         notes.append("no current is recorded: friction, torque constant and inertia are hard to tell apart")
     if "encoder_position" not in present:
-        notes.append("no encoder position is recorded: sensor offsets, slack and backlash cannot be told apart")
-    few = [c for c in features.conditions
-           if all(b.n < 5 for b in features.blocks if b.condition == c)]
+        notes.append(
+            "no encoder position is recorded: sensor offsets, slack and backlash cannot be told apart"
+        )
+    few = [c for c in features.conditions if all(b.n < 5 for b in features.blocks if b.condition == c)]
     if few:
-        notes.append(f"fewer than five closures of {', '.join(few)}: the repeatability is a guess from the priors")
+        notes.append(
+            f"fewer than five closures of {', '.join(few)}: the repeatability is a guess from the priors"
+        )
     return Prepared(rig, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))

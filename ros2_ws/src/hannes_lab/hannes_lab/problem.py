@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from hannes_description.model import EffectEntry, Model
-from hannes_sim.effect import EffectType, load_effect
+from hannes_sim.effect import EffectType
 from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
@@ -57,18 +57,26 @@ class Coordinate:
         return min(max(raw, self.lower), self.upper)
 
     def z(self, value: float) -> float:
-        return float(np.log(value / self.offset)) / self.scale if self.log else (value - self.offset) / self.scale
+        return (
+            float(np.log(value / self.offset)) / self.scale
+            if self.log
+            else (value - self.offset) / self.scale
+        )
 
     @property
     def bounds(self) -> tuple[float, float]:
-        low = -np.inf if not np.isfinite(self.lower) or (self.log and self.lower <= 0.0) else self.z(self.lower)
+        low = (
+            -np.inf if not np.isfinite(self.lower) or (self.log and self.lower <= 0.0) else self.z(self.lower)
+        )
         high = np.inf if not np.isfinite(self.upper) else self.z(self.upper)
         return low, high
 
 
 def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
     """z in standard deviations of the prior; a step of half of one is well above the simulation's own roughness."""
-    return Coordinate(nuisance.name, nuisance.mean, nuisance.sd, nuisance.log, -np.inf, np.inf, True, 0.5, nuisance.unit)
+    return Coordinate(
+        nuisance.name, nuisance.mean, nuisance.sd, nuisance.log, -np.inf, np.inf, True, 0.5, nuisance.unit
+    )
 
 
 def effect_coordinates(effect: EffectType) -> list[Coordinate]:
@@ -76,18 +84,30 @@ def effect_coordinates(effect: EffectType) -> list[Coordinate]:
     out = []
     for p in effect.parameters:
         if p.vanishing is None and p.lower > 0.0:
-            out.append(Coordinate(f"{effect.name}.{p.name}", p.typical, 1.0, True, p.lower, p.upper, False, 0.03, p.unit))
+            out.append(
+                Coordinate(
+                    f"{effect.name}.{p.name}", p.typical, 1.0, True, p.lower, p.upper, False, 0.03, p.unit
+                )
+            )
         else:
             away = p.vanishing or 0.0
             scale = abs(p.typical - away) or 0.05 * (p.upper - p.lower)
-            out.append(Coordinate(f"{effect.name}.{p.name}", away, scale, False, p.lower, p.upper, False, 0.03, p.unit))
+            out.append(
+                Coordinate(
+                    f"{effect.name}.{p.name}", away, scale, False, p.lower, p.upper, False, 0.03, p.unit
+                )
+            )
     return out
 
 
-def vanishing_entry(effect: EffectType, source: str | None, shape: Mapping[str, float] | None = None) -> EffectEntry:
+def vanishing_entry(
+    effect: EffectType, source: str | None, shape: Mapping[str, float] | None = None
+) -> EffectEntry:
     """The effect switched off, in a model in which its parameters can then be moved."""
-    values = {p.name: p.vanishing if p.vanishing is not None else (shape or {}).get(p.name, p.typical)
-              for p in effect.parameters}
+    values = {
+        p.name: p.vanishing if p.vanishing is not None else (shape or {}).get(p.name, p.typical)
+        for p in effect.parameters
+    }
     return effect.entry(values, source=source)
 
 
@@ -126,8 +146,9 @@ class Problem:
         return self.whiten(self._measured - predicted)
 
 
-def build_problem(rig: Rig, features: Features, model: Model, nuisances: Sequence[Nuisance],
-                  values: Mapping[str, float]) -> Problem:
+def build_problem(
+    rig: Rig, features: Features, model: Model, nuisances: Sequence[Nuisance], values: Mapping[str, float]
+) -> Problem:
     """Estimate noise and scatter from the repeats, with sensitivities taken at `values` of `model`.
 
     Where a condition has a single closure its scatter is that of the priors (closure_sd), and its sample variance is
@@ -155,16 +176,20 @@ def build_problem(rig: Rig, features: Features, model: Model, nuisances: Sequenc
         own = [k for k, block in enumerate(features.blocks) if block.condition == condition]
         n = features.blocks[own[0]].n
         v = np.concatenate([variances[k] for k in own])
-        jacobian = (np.column_stack([np.concatenate([column[k] for k in own]) for column in columns])
-                    if columns else np.zeros((v.size, 0)))
+        jacobian = (
+            np.column_stack([np.concatenate([column[k] for k in own]) for column in columns])
+            if columns
+            else np.zeros((v.size, 0))
+        )
         power = np.ones(jacobian.shape[1])
         if n >= 3 and jacobian.shape[1] and len({features.blocks[k].n for k in own}) == 1:
             e = np.concatenate([deviations[k] for k in own], axis=1)
             power, v = _estimate_scatter(e, jacobian, v)
         single = np.diag(v) + (jacobian * power) @ jacobian.T
         for part, count in _parts(features, own, n):
-            rows = np.concatenate([np.arange(features.slices[k].start + a, features.slices[k].start + b)
-                                   for k, a, b in part])
+            rows = np.concatenate(
+                [np.arange(features.slices[k].start + a, features.slices[k].start + b) for k, a, b in part]
+            )
             if rows.size:
                 whitener.append((rows, np.linalg.cholesky(single / count)))
     return Problem(rig, features, tuple(whitener))
@@ -174,8 +199,11 @@ def _parts(features: Features, own: Sequence[int], n: int) -> list[tuple[list[tu
     """Mean and drift parts of a condition's blocks, each with the count that divides the covariance of one closure."""
     mean = [(k, 0, features.blocks[k].phase.size) for k in own]
     parts: list[tuple[list[tuple[int, int, int]], float]] = [(mean, float(n))]
-    drift = [(k, features.blocks[k].phase.size, features.blocks[k].size) for k in own
-             if features.blocks[k].size > features.blocks[k].phase.size]
+    drift = [
+        (k, features.blocks[k].phase.size, features.blocks[k].size)
+        for k in own
+        if features.blocks[k].size > features.blocks[k].phase.size
+    ]
     if len(drift) == len(own):
         ramp = np.linspace(-0.5, 0.5, n)
         parts.append((drift, float(ramp @ ramp)))

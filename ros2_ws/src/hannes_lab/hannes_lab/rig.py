@@ -58,7 +58,9 @@ class Rig(Protocol):
     def nuisances(self, model: Model) -> Sequence[Nuisance]:
         """The uncertain nominal parameters with their priors."""
 
-    def simulate(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Mapping[str, Array]:
+    def simulate(
+        self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
+    ) -> Mapping[str, Array]:
         """Logged signals on the control grid for a reference (n,): what each logger would show at tick k.
 
         `values` overrides parameters of the model by name (nominal ones, and effect.parameter).

@@ -14,7 +14,14 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from .fit import Fit, finite_differences, fit
-from .problem import Coordinate, Problem, build_problem, effect_coordinates, nuisance_coordinate, vanishing_entry
+from .problem import (
+    Coordinate,
+    Problem,
+    build_problem,
+    effect_coordinates,
+    nuisance_coordinate,
+    vanishing_entry,
+)
 from .rig import Nuisance
 
 Array = NDArray[np.float64]
@@ -93,8 +100,9 @@ class Search:
             coordinates += effect_coordinates(kind)
         return model, tuple(coordinates)
 
-    def starts(self, name: str, base: Fit, model: Model, coordinates: Sequence[Coordinate], keep: int
-               ) -> list[tuple[float, dict[str, float]]]:
+    def starts(
+        self, name: str, base: Fit, model: Model, coordinates: Sequence[Coordinate], keep: int
+    ) -> list[tuple[float, dict[str, float]]]:
         """Best starting points of one effect on top of a fit, by a scan with the nuisance parameters compensated.
 
         Scans the strength at every start of the shape parameters; what the nuisance parameters could take over is
@@ -134,7 +142,9 @@ class Search:
         """
         names = tuple(dict.fromkeys(c.name.split(".")[0] for c in base.coordinates if not c.prior))
         if names not in self._prior_points:
-            z = np.array([0.0 if c.prior else float(v) for c, v in zip(base.coordinates, base.z, strict=True)])
+            z = np.array(
+                [0.0 if c.prior else float(v) for c, v in zip(base.coordinates, base.z, strict=True)]
+            )
             values = {c.name: c.value(float(v)) for c, v in zip(base.coordinates, z, strict=True)}
             r = self.problem.residual(base.model, values)
             jacobian = finite_differences(self.problem, base.model, base.coordinates, z, r, range(z.size))
@@ -152,14 +162,18 @@ class Search:
         moved, z = r + jacobian @ step, base.z + step
         return float(moved @ moved + (prior * z) @ (prior * z)), np.clip(z, -8.0, 8.0)
 
-    def add(self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None = None) -> Candidate:
+    def add(
+        self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None = None
+    ) -> Candidate:
         """Fit the base set plus one effect, from the best points of the scan (or the given ones)."""
         model, coordinates = self.with_effects((*base.names, name))
         known = {c.name: base.fit.jacobian[:, j] for j, c in enumerate(base.fit.coordinates) if c.prior}
         if starts is None:
             starts = [start for _, start in self.starts(name, base.fit, model, coordinates, KEEP)]
-        tried = [fit(self.problem, model, coordinates, start, rows=self.rows, known=known, evaluations=10)
-                 for start in starts]
+        tried = [
+            fit(self.problem, model, coordinates, start, rows=self.rows, known=known, evaluations=10)
+            for start in starts
+        ]
         return self._keep(base, name, min(tried, key=lambda f: f.cost))
 
     def _keep(self, base: Candidate, name: str, best: Fit) -> Candidate:
@@ -179,7 +193,9 @@ class Search:
 
     def renewed(self, best: Candidate) -> Search:
         """The same search with noise and scatter estimated at another point: sensitivities there are the true ones."""
-        problem = build_problem(self.problem.rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values)
+        problem = build_problem(
+            self.problem.rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values
+        )
         problem.simulations, problem.failures = self.problem.simulations, self.problem.failures
         return Search(problem, self.model, self.nuisances, self.sources, self.jobs, self.progress, self.rows)
 
@@ -196,8 +212,8 @@ class Search:
     def extend(self, bases: Sequence[Candidate], names: Sequence[str], text: str) -> list[Candidate]:
         """The bases with one further effect each, sorted by penalised cost.
 
-        All extensions are scanned; the REFIT most promising are refitted in closed loop, the POLISH best of them with all
-        derivatives taken afresh.
+        All extensions are scanned; the REFIT most promising are refitted in closed loop, the POLISH best of them
+        with all derivatives taken afresh.
         """
         todo: dict[Names, tuple[Candidate, str]] = {}
         for base in bases:
@@ -225,11 +241,11 @@ class Search:
                 self.progress(k + 1, len(items), text)
             return out
         arguments = (self.problem, self.model, tuple(self.nuisances), dict(self.sources), self.rows)
-        batches = [list(items[k::self.jobs]) for k in range(self.jobs)]
+        batches = [list(items[k :: self.jobs]) for k in range(self.jobs)]
         results = Parallel(n_jobs=self.jobs)(delayed(_batch)(arguments, function, batch) for batch in batches)
         merged: list[Any] = [None] * len(items)
         for k, (part, simulations, failures) in enumerate(results):
-            merged[k::self.jobs] = part
+            merged[k :: self.jobs] = part
             self.problem.simulations += simulations
             self.problem.failures += failures
         self.progress(len(items), len(items), text)
@@ -245,8 +261,11 @@ class Search:
             kind = self.effect(name)
             model, coordinates = self.with_effects((*base.names, name))
             own = [c for c in coordinates if c.name.startswith(f"{name}.")]
-            shapes = [[(f"{name}.{p.name}", v) for v in (p.starts or (p.typical,))]
-                      for p in kind.parameters if p.vanishing is None]
+            shapes = [
+                [(f"{name}.{p.name}", v) for v in (p.starts or (p.typical,))]
+                for p in kind.parameters
+                if p.vanishing is None
+            ]
             strengths = [c for c, p in zip(own, kind.parameters, strict=True) if p.vanishing is not None]
             out[name] = []
             for shape in itertools.product(*shapes):
@@ -258,8 +277,9 @@ class Search:
         return out
 
 
-def _batch(arguments: tuple[Any, ...], function: Callable[..., Any], items: list[tuple[Any, ...]]
-           ) -> tuple[list[Any], int, int]:
+def _batch(
+    arguments: tuple[Any, ...], function: Callable[..., Any], items: list[tuple[Any, ...]]
+) -> tuple[list[Any], int, int]:
     problem, model, nuisances, sources, rows = arguments
     problem.simulations = problem.failures = 0
     search = Search(problem, model, nuisances, sources, rows=rows)

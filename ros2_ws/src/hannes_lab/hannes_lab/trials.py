@@ -58,8 +58,10 @@ class Trial:
         if self.reference.ndim != 1 or self.reference.size < 2:
             raise HannesError(f"Trial '{self.name}': the reference is too short to be replayed.")
         if not self.closures:
-            raise HannesError(f"Trial '{self.name}': no closure was found: the reference never leaves its rest value "
-                              "and comes back. Record at least one whole closure.")
+            raise HannesError(
+                f"Trial '{self.name}': no closure was found: the reference never leaves its rest value "
+                "and comes back. Record at least one whole closure."
+            )
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -92,18 +94,25 @@ def reference_on_grid(time: Array, values: Array, period: float, duration: float
     span = float(np.ptp(values)) or 1.0
     moving = np.abs(values - rest) > 1e-9 * span
     for first, last in _runs(moving):
-        t, v = time[first:last + 1], values[first:last + 1]
+        t, v = time[first : last + 1], values[first : last + 1]
         if t.size < 4:
             continue
         curve = PchipInterpolator(t, v, extrapolate=True)
         left, right = t[0], t[-1]
         if first > 0:
             slope = (v[1] - v[0]) / (t[1] - t[0])
-            left = max(time[first - 1], t[0] - (v[0] - rest) / slope) if slope * (v[0] - rest) > 0 else time[first - 1]
+            left = (
+                max(time[first - 1], t[0] - (v[0] - rest) / slope)
+                if slope * (v[0] - rest) > 0
+                else time[first - 1]
+            )
         if last < time.size - 1:
             slope = (v[-1] - v[-2]) / (t[-1] - t[-2])
-            right = min(time[last + 1], t[-1] + (v[-1] - rest) / -slope) if slope * (v[-1] - rest) < 0 \
+            right = (
+                min(time[last + 1], t[-1] + (v[-1] - rest) / -slope)
+                if slope * (v[-1] - rest) < 0
                 else time[last + 1]
+            )
         inside = (grid >= t[0]) & (grid <= t[-1])
         out[inside] = curve(grid[inside])
         if first > 0:
@@ -146,7 +155,9 @@ def find_closures(reference: Array, period: float, *, lead: float = 0.03) -> lis
     return out
 
 
-def group_closures(reference: Array, period: float, spans: Iterable[tuple[float, float]], name: str) -> list[Closure]:
+def group_closures(
+    reference: Array, period: float, spans: Iterable[tuple[float, float]], name: str
+) -> list[Closure]:
     """Closures whose reference is the same (within 3 % of its span, and 3 % of its length) share a condition.
 
     Cut-off closures (less than 80 % of the usual length of their condition) are dropped.
@@ -154,11 +165,15 @@ def group_closures(reference: Array, period: float, spans: Iterable[tuple[float,
     kinds: list[tuple[Array, float]] = []
     members: list[tuple[float, float, int]] = []
     for start, stop in spans:
-        shape = reference[np.clip(np.arange(round(start / period), round(stop / period) + 1), 0, reference.size - 1)]
+        shape = reference[
+            np.clip(np.arange(round(start / period), round(stop / period) + 1), 0, reference.size - 1)
+        ]
         span = float(np.ptp(shape)) or 1.0
         for index, (other, length) in enumerate(kinds):
             n = min(shape.size, other.size)
-            alike = n >= 0.3 * other.size and float(np.max(np.abs(shape[:n] - other[:n]))) <= 0.03 * span + 1e-9
+            alike = (
+                n >= 0.3 * other.size and float(np.max(np.abs(shape[:n] - other[:n]))) <= 0.03 * span + 1e-9
+            )
             longer = max(shape.size, other.size) * period
             if alike and (abs((stop - start) - length) <= 0.03 * length or n * period < longer):
                 members.append((start, stop, index))
@@ -175,8 +190,9 @@ def group_closures(reference: Array, period: float, spans: Iterable[tuple[float,
     return sorted(out, key=lambda closure: closure.start)
 
 
-def make_trial(recording: Recording, *, name: str | None = None, period: float = 1e-3,
-               signals: Sequence[str] = SIGNALS) -> Trial:
+def make_trial(
+    recording: Recording, *, name: str | None = None, period: float = 1e-3, signals: Sequence[str] = SIGNALS
+) -> Trial:
     """A trial from a recording; the condition's name and options come from its metadata where it has them.
 
     Raises HannesError where the recording has no reference or none of the signals.
@@ -186,8 +202,10 @@ def make_trial(recording: Recording, *, name: str | None = None, period: float =
     if "motor_current" not in present and "motor_effort" in recording.channels:
         present.append("motor_effort")
     if not present:
-        raise HannesError(f"{recording.source}: none of the signals {', '.join(signals)} is recorded; nothing can be "
-                          "compared.")
+        raise HannesError(
+            f"{recording.source}: none of the signals {', '.join(signals)} is recorded; nothing can be "
+            "compared."
+        )
     notes = list(recording.warnings)
     meta = recording.metadata
     name = name or str(meta.get("condition") or _stem(recording.source))
@@ -195,11 +213,15 @@ def make_trial(recording: Recording, *, name: str | None = None, period: float =
     origin = float(channel.time[0])
     origin = math.floor(origin / period + 1e-6) * period
     duration = max(float(recording[s].time[-1]) for s in ("reference_position", *present)) - origin
-    reference, note = reference_on_grid(channel.time - origin, np.asarray(channel.values, dtype=float), period, duration)
+    reference, note = reference_on_grid(
+        channel.time - origin, np.asarray(channel.values, dtype=float), period, duration
+    )
     if note:
         notes.append(note)
-    samples = {s: (np.asarray(recording[s].time) - origin, np.asarray(recording[s].values, dtype=float))
-               for s in present}
+    samples = {
+        s: (np.asarray(recording[s].time) - origin, np.asarray(recording[s].values, dtype=float))
+        for s in present
+    }
     begin = max(float(t[0]) for t, _ in samples.values())
     end = min(float(t[-1]) for t, _ in samples.values())
     spans = find_closures(reference, period)
@@ -208,8 +230,17 @@ def make_trial(recording: Recording, *, name: str | None = None, period: float =
     if spans and len(closures) < len(spans):
         notes.append(f"{len(spans) - len(closures)} of {len(spans)} closures are cut off and left out")
     options = {key: meta[key] for key in ("object", "sensors", "pose", "encoder_session") if key in meta}
-    return Trial(name, period, reference, samples, tuple(closures), options, recording.source, recording.sha256,
-                 tuple(notes))
+    return Trial(
+        name,
+        period,
+        reference,
+        samples,
+        tuple(closures),
+        options,
+        recording.source,
+        recording.sha256,
+        tuple(notes),
+    )
 
 
 def _stem(source: str) -> str:
@@ -228,7 +259,9 @@ def unique_names(trials: Sequence[Trial]) -> list[Trial]:
         taken[trial.name] = count + 1
         if count:
             new = f"{trial.name}#{count + 1}"
-            closures = tuple(replace(c, condition=c.condition.replace(trial.name, new, 1)) for c in trial.closures)
+            closures = tuple(
+                replace(c, condition=c.condition.replace(trial.name, new, 1)) for c in trial.closures
+            )
             trial = replace(trial, name=new, closures=closures)
         out.append(trial)
     return out

@@ -16,12 +16,11 @@ from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
-from numba import cfunc
-from numpy.typing import NDArray
-
 from hannes_description.errors import HannesError
 from hannes_description.model import EffectEntry
 from hannes_description.parameters import Parameter
+from numba import cfunc
+from numpy.typing import NDArray
 
 from .native import EFFECT_SIGNATURE
 from .ports import N_INPUTS, N_OUTPUTS
@@ -54,15 +53,20 @@ class EffectParameter:
 
     def __post_init__(self) -> None:
         if not self.lower <= self.typical <= self.upper:
-            raise HannesError(f"Effect parameter '{self.name}': typical {self.typical} is outside "
-                              f"[{self.lower}, {self.upper}].")
+            raise HannesError(
+                f"Effect parameter '{self.name}': typical {self.typical} is outside "
+                f"[{self.lower}, {self.upper}]."
+            )
         if self.vanishing is not None and not self.lower <= self.vanishing <= self.upper:
-            raise HannesError(f"Effect parameter '{self.name}': vanishing {self.vanishing} is outside "
-                              f"[{self.lower}, {self.upper}].")
+            raise HannesError(
+                f"Effect parameter '{self.name}': vanishing {self.vanishing} is outside "
+                f"[{self.lower}, {self.upper}]."
+            )
         outside = [value for value in self.starts if not self.lower <= value <= self.upper]
         if outside:
-            raise HannesError(f"Effect parameter '{self.name}': starts {outside} are outside "
-                              f"[{self.lower}, {self.upper}].")
+            raise HannesError(
+                f"Effect parameter '{self.name}': starts {outside} are outside [{self.lower}, {self.upper}]."
+            )
 
 
 class Effect:
@@ -100,9 +104,15 @@ class Effect:
         return next(p for p in cls.parameters if p.vanishing is not None)
 
     @classmethod
-    def entry(cls, values: Mapping[str, float] | None = None, *, source: str | None = None,
-              status: str = "assumed", where: str = "typical value of the effect",
-              intervals: Mapping[str, tuple[float, float]] | None = None) -> EffectEntry:
+    def entry(
+        cls,
+        values: Mapping[str, float] | None = None,
+        *,
+        source: str | None = None,
+        status: str = "assumed",
+        where: str = "typical value of the effect",
+        intervals: Mapping[str, tuple[float, float]] | None = None,
+    ) -> EffectEntry:
         """An entry for a model file; parameters that are not given take their typical value.
 
         `intervals` (confidence intervals) become the entry's bounds, otherwise the effect's own bounds do.
@@ -110,14 +120,17 @@ class Effect:
         values = dict(values or {})
         unknown = sorted(set(values) - {p.name for p in cls.parameters})
         if unknown:
-            raise HannesError(f"Effect '{cls.name}' has no parameter {', '.join(unknown)}; "
-                              f"valid are {', '.join(p.name for p in cls.parameters)}.")
+            raise HannesError(
+                f"Effect '{cls.name}' has no parameter {', '.join(unknown)}; "
+                f"valid are {', '.join(p.name for p in cls.parameters)}."
+            )
         entries = {}
         for p in cls.parameters:
             value = float(values.get(p.name, p.typical))
             if not p.lower <= value <= p.upper:
-                raise HannesError(f"Effect '{cls.name}': {p.name} = {value} {p.unit} is outside "
-                                  f"[{p.lower}, {p.upper}].")
+                raise HannesError(
+                    f"Effect '{cls.name}': {p.name} = {value} {p.unit} is outside [{p.lower}, {p.upper}]."
+                )
             low, high = (intervals or {}).get(p.name, (p.lower, p.upper))
             entries[p.name] = Parameter(value, p.unit, min(low, value), max(high, value), status, where)
         return EffectEntry(cls.name, entries, source)
@@ -133,15 +146,22 @@ def check_effect(effect: EffectType, where: str) -> EffectType:
     if not effect.parameters:
         raise HannesError(f"{where}: effect '{effect.name}' declares no parameters.")
     if all(p.vanishing is None for p in effect.parameters):
-        raise HannesError(f"{where}: effect '{effect.name}' needs a parameter with a `vanishing` value (off).")
-    if "contribute" not in effect.__dict__ and all("contribute" not in b.__dict__ for b in effect.__mro__[:-2]):
+        raise HannesError(
+            f"{where}: effect '{effect.name}' needs a parameter with a `vanishing` value (off)."
+        )
+    if "contribute" not in effect.__dict__ and all(
+        "contribute" not in b.__dict__ for b in effect.__mro__[:-2]
+    ):
         raise HannesError(f"{where}: effect '{effect.name}' defines no `contribute(x, p, s, y)`.")
     return effect
 
 
 def _effects_in(module: ModuleType) -> list[EffectType]:
-    return [c for _, c in inspect.getmembers(module, inspect.isclass)
-            if issubclass(c, Effect) and c is not Effect and c.__module__ == module.__name__ and c.name]
+    return [
+        c
+        for _, c in inspect.getmembers(module, inspect.isclass)
+        if issubclass(c, Effect) and c is not Effect and c.__module__ == module.__name__ and c.name
+    ]
 
 
 @cache
@@ -155,7 +175,9 @@ def catalogue() -> Mapping[str, EffectType]:
     for point in entry_points(group=ENTRY_POINTS):
         effect = check_effect(point.load(), f"entry point {point.value}")
         if effect.name in found:
-            raise HannesError(f"Entry point {point.value}: an effect named '{effect.name}' exists already; rename it.")
+            raise HannesError(
+                f"Entry point {point.value}: an effect named '{effect.name}' exists already; rename it."
+            )
         found[effect.name] = effect
     return found
 
@@ -166,8 +188,10 @@ def load_effect(name_or_source: str) -> EffectType:
     if ":" not in name_or_source:
         found = catalogue()
         if name_or_source not in found:
-            raise HannesError(f"Unknown effect '{name_or_source}'; the catalogue has {', '.join(sorted(found))}; "
-                              "an own effect is given as path.py:Class.")
+            raise HannesError(
+                f"Unknown effect '{name_or_source}'; the catalogue has {', '.join(sorted(found))}; "
+                "an own effect is given as path.py:Class."
+            )
         return found[name_or_source]
     file, _, class_name = name_or_source.rpartition(":")
     effect = load_class(file, class_name, "effect")
@@ -196,8 +220,9 @@ def load_class(file: str, class_name: str, what: str) -> Any:
             del sys.modules[module_name]
             raise HannesError(f"'{file}' cannot be imported: {type(error).__name__}: {error}.") from error
     if not hasattr(module, class_name):
-        names = ", ".join(c.__name__ for _, c in inspect.getmembers(module, inspect.isclass)
-                          if c.__module__ == module_name)
+        names = ", ".join(
+            c.__name__ for _, c in inspect.getmembers(module, inspect.isclass) if c.__module__ == module_name
+        )
         raise HannesError(f"'{file}' has no '{class_name}'; it has {names or 'no classes'}.")
     return getattr(module, class_name)
 
@@ -209,9 +234,11 @@ def compile_effect(effect: EffectType) -> Any:
         return cfunc(EFFECT_SIGNATURE, cache=_cacheable(effect))(effect.contribute)
     except Exception as error:  # numba's errors are long; the user needs the effect and the reason
         reason = str(error).strip().splitlines()
-        raise HannesError(f"Effect '{effect.name}': contribute(x, p, s, y) cannot be compiled: "
-                          f"{type(error).__name__}: {reason[0] if reason else ''} (plain arithmetic, math functions "
-                          "and the constants of hannes_sim.ports are allowed).") from error
+        raise HannesError(
+            f"Effect '{effect.name}': contribute(x, p, s, y) cannot be compiled: "
+            f"{type(error).__name__}: {reason[0] if reason else ''} (plain arithmetic, math functions "
+            "and the constants of hannes_sim.ports are allowed)."
+        ) from error
 
 
 def _cacheable(effect: EffectType) -> bool:
@@ -230,7 +257,7 @@ class BoundEffects:
     def __init__(self, effects: tuple[tuple[EffectType, Mapping[str, float]], ...]) -> None:
         self.effects = tuple(effect for effect, _ in effects)
         self.index = {(effect.name, p.name): 0 for effect in self.effects for p in effect.parameters}
-        self._functions = [compile_effect(effect) for effect in self.effects]
+        self._functions = [compile_effect(effect) for effect in self.effects]  # type: ignore[arg-type]  # a class is hashable
         n_parameters = sum(len(effect.parameters) for effect in self.effects)
         self.parameters: NDArray[np.float64] = np.zeros(max(1, n_parameters))
         self.states: NDArray[np.float64] = np.zeros(max(1, sum(effect.states for effect in self.effects)))
@@ -256,8 +283,12 @@ class BoundEffects:
         return cls(tuple((load_effect(e.source or e.name), e.values) for e in entries))
 
 
-def evaluate(effect: EffectType, values: Mapping[str, float], inputs: Mapping[int, float],
-             states: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+def evaluate(
+    effect: EffectType,
+    values: Mapping[str, float],
+    inputs: Mapping[int, float],
+    states: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
     """Outputs (N_OUTPUTS,) of one effect for given inputs, in plain Python; for tests and pictures."""
     x = np.zeros(N_INPUTS)
     for index, value in inputs.items():
@@ -269,7 +300,10 @@ def evaluate(effect: EffectType, values: Mapping[str, float], inputs: Mapping[in
 
 
 def effect_source(effect: EffectType, given: str) -> str | None:
-    """What a model file stores so that the effect is found again: None for the catalogue, else an absolute path:Class."""
+    """What a model file stores so that the effect is found again.
+
+    None for the catalogue, else an absolute path:Class.
+    """
     if ":" not in given:
         return None
     file, _, class_name = given.rpartition(":")

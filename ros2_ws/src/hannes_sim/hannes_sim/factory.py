@@ -29,5 +29,7 @@ def make_plant(model: Model, grasp: GraspObject | None = None, *, dt: float | No
         file, _, name = model.plant.rpartition(":")
         plant: Any = load_class(file, name, "plant")(model, grasp, dt=step)
         return plant  # type: ignore[no-any-return]
-    raise HannesError(f"Model '{model.name}': unknown plant '{model.plant}'; valid are {', '.join(PLANTS)}, or "
-                      "path.py:Class for your own.")
+    raise HannesError(
+        f"Model '{model.name}': unknown plant '{model.plant}'; valid are {', '.join(PLANTS)}, or "
+        "path.py:Class for your own."
+    )

@@ -12,10 +12,9 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
+from hannes_description.errors import HannesError
 from numpy.typing import NDArray
 from scipy.special import erf
-
-from hannes_description.errors import HannesError
 
 from .rollout import Rollout
 
@@ -62,8 +61,9 @@ class Sensors:
     def from_dict(cls, content: Mapping[str, Any]) -> Sensors:
         unknown = sorted(set(content) - {item.name for item in fields(cls)})
         if unknown:
-            raise HannesError(f"Sensors: unknown keys {unknown}; valid are "
-                              f"{', '.join(item.name for item in fields(cls))}.")
+            raise HannesError(
+                f"Sensors: unknown keys {unknown}; valid are {', '.join(item.name for item in fields(cls))}."
+            )
         return cls(**content)
 
     def sample(self, run: Rollout, rng: np.random.Generator | None = None) -> dict[str, tuple[Array, Array]]:
@@ -74,8 +74,9 @@ class Sensors:
         out["reference_position"] = (at, take(time, run.reference_position, at))
         at = sample_times(time[0], time[-1], self.motor_rate)
         out["encoder_position"] = (at, take(time, run.encoder_position, at))
-        current = logged_current(time, run.motor_current, at, rectified=self.current_rectified,
-                                 window=self.current_window)
+        current = logged_current(
+            time, run.motor_current, at, rectified=self.current_rectified, window=self.current_window
+        )
         if rng is not None:
             current = current + self.current_noise * rng.standard_normal(at.size)
             if self.current_rectified:
@@ -87,7 +88,10 @@ class Sensors:
         if self.force_rate > 0.0:
             at = sample_times(time[0], time[-1], self.force_rate)
             force = take(time, run.grip_force, at)
-            out["grip_force"] = (at, force if rng is None else force + self.force_noise * rng.standard_normal(at.size))
+            out["grip_force"] = (
+                at,
+                force if rng is None else force + self.force_noise * rng.standard_normal(at.size),
+            )
         return out
 
 
@@ -142,8 +146,14 @@ def sample_noise(values: Array) -> float:
 THESIS = Sensors()
 """The thesis' log (P17): encoder and rectified current at 30 Hz."""
 
-BENCH = Sensors(motor_rate=100.0, current_rectified=False, current_window=0.01, current_noise=0.005, voltage_rate=100.0,
-                force_rate=100.0)
+BENCH = Sensors(
+    motor_rate=100.0,
+    current_rectified=False,
+    current_window=0.01,
+    current_noise=0.005,
+    voltage_rate=100.0,
+    force_rate=100.0,
+)
 """A better log: signed current, voltage and force at 100 Hz."""
 
 SENSORS: Mapping[str, Sensors] = {"thesis": THESIS, "bench": BENCH}

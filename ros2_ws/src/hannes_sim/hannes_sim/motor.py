@@ -8,11 +8,51 @@ from numba import njit
 
 from .native import call_effect, pointer_f8, pointer_i8
 from .ports import (
-    BRUSH, CURRENT, DELAY, DELAY_RING, DT, H_DELAY, H_EFFECTS, H_INPUTS, H_OUTPUTS, H_PARAMETERS, H_READING, H_STATE, KT_REL,
-    N_OUTPUTS, P_CURRENT_OFFSET, P_DELAY, P_DT, P_EFFICIENCY, P_INDUCTANCE, P_KT, P_KT_NOMINAL, P_RATIO, P_RESISTANCE,
-    P_RESOLUTION, P_SUPPLY, P_ZERO, R_CURRENT, R_EFFORT, R_POSITION, R_TIME, R_VELOCITY, RESISTANCE, RESISTANCE_REL,
-    S_CURRENT, S_DELAY_INDEX, S_POSITION_READ, S_TIME_STEPS, SENSE_CURRENT, SENSE_CURRENT_GAIN, SENSE_POSITION, SUPPLY, T,
-    V, VOLTAGE, VOLTAGE_DROP,
+    BRUSH,
+    CURRENT,
+    DELAY,
+    DELAY_RING,
+    DT,
+    H_DELAY,
+    H_EFFECTS,
+    H_INPUTS,
+    H_OUTPUTS,
+    H_PARAMETERS,
+    H_READING,
+    H_STATE,
+    KT_REL,
+    N_OUTPUTS,
+    P_CURRENT_OFFSET,
+    P_DELAY,
+    P_DT,
+    P_EFFICIENCY,
+    P_INDUCTANCE,
+    P_KT,
+    P_KT_NOMINAL,
+    P_RATIO,
+    P_RESISTANCE,
+    P_RESOLUTION,
+    P_SUPPLY,
+    P_ZERO,
+    R_CURRENT,
+    R_EFFORT,
+    R_POSITION,
+    R_TIME,
+    R_VELOCITY,
+    RESISTANCE,
+    RESISTANCE_REL,
+    S_CURRENT,
+    S_DELAY_INDEX,
+    S_POSITION_READ,
+    S_TIME_STEPS,
+    SENSE_CURRENT,
+    SENSE_CURRENT_GAIN,
+    SENSE_POSITION,
+    SUPPLY,
+    VOLTAGE,
+    VOLTAGE_DROP,
+    T,
+    V,
 )  # fmt: skip
 
 
@@ -80,8 +120,10 @@ def motor_torque(handle):  # type: ignore[no-untyped-def]
     decay = math.exp(-rate)
     if y[BRUSH] > 0.0:
         held = drive + decay * resistance / (1.0 - decay) * before
-        final = ((max(held - y[BRUSH], 0.0) + min(held + y[BRUSH], 0.0)) * (1.0 - decay) / resistance
-                 - decay * before) / (1.0 - decay)
+        final = (
+            (max(held - y[BRUSH], 0.0) + min(held + y[BRUSH], 0.0)) * (1.0 - decay) / resistance
+            - decay * before
+        ) / (1.0 - decay)
     if rate < math.inf:
         after = final + (before - final) * decay
         mean = final + (before - final) * (1.0 - decay) / rate

@@ -58,7 +58,9 @@ def call_control(typingctx, address, x, p, s):  # type: ignore[no-untyped-def]
 @intrinsic
 def call_advance(typingctx, address, handle, voltage, steps):  # type: ignore[no-untyped-def]
     """Call advance(handle, voltage, steps) by address; handle is an int64 address."""
-    return _call(types.void, (types.int64, types.float64, types.int64))(typingctx, address, handle, voltage, steps)
+    return _call(types.void, (types.int64, types.float64, types.int64))(
+        typingctx, address, handle, voltage, steps
+    )
 
 
 @intrinsic

@@ -38,33 +38,46 @@ class GraspObject:
         for name, low in (("size", 0.0), ("stiffness", 0.0), ("damping", -1e-12), ("friction", -1e-12)):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > low):
-                raise HannesError(f"Object {name} is {value}; it must be a finite number above {max(low, 0.0)}.")
+                raise HannesError(
+                    f"Object {name} is {value}; it must be a finite number above {max(low, 0.0)}."
+                )
         if len(self.place) != 3 or not all(math.isfinite(c) for c in self.place):
             raise HannesError(f"Object place is {self.place}; it must be three finite numbers in m.")
 
     def to_dict(self) -> dict[str, Any]:
-        return {"shape": self.shape, "size": self.size, "stiffness": self.stiffness, "damping": self.damping,
-                "friction": self.friction, "place": list(self.place)}
+        return {
+            "shape": self.shape,
+            "size": self.size,
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "friction": self.friction,
+            "place": list(self.place),
+        }
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> GraspObject:
         unknown = sorted(set(content) - set(cls.__dataclass_fields__))
         if unknown:
-            raise HannesError(f"Object: unknown keys {unknown}; valid are {', '.join(cls.__dataclass_fields__)}.")
+            raise HannesError(
+                f"Object: unknown keys {unknown}; valid are {', '.join(cls.__dataclass_fields__)}."
+            )
         values = dict(content)
         if "place" in values:
             values["place"] = tuple(float(c) for c in values["place"])
         return cls(**values)
 
 
-SOFT_BALL = GraspObject(shape="sphere", size=0.080, stiffness=400.0, damping=2.0, place=(-0.012, -0.002, 0.004))
+SOFT_BALL = GraspObject(
+    shape="sphere", size=0.080, stiffness=400.0, damping=2.0, place=(-0.012, -0.002, 0.004)
+)
 """A ball that deforms visibly (thesis P18): about 0.4 kN/m in all; all fingers but the little one reach it."""
 
 RIGID_DYNAMOMETER = GraspObject(shape="capsule", size=0.065, stiffness=40000.0, damping=20.0)
 """A hand dynamometer (thesis P17): at least 40 kN/m."""
 
 OBJECTS: Mapping[str, GraspObject | None] = MappingProxyType(
-    {"none": None, "soft": SOFT_BALL, "rigid": RIGID_DYNAMOMETER})
+    {"none": None, "soft": SOFT_BALL, "rigid": RIGID_DYNAMOMETER}
+)
 """Objects by the names that nodes and the command line take."""
 
 

@@ -48,10 +48,17 @@ class Reading:
     @classmethod
     def of(cls, reading: NDArray[np.float64]) -> Reading:
         """From the flat reading buffer of a plant (ports.R_*)."""
-        joints = reading[R_JOINTS:R_JOINTS + 2 * N_JOINTS].copy()
-        return cls(float(reading[R_TIME]), float(reading[R_POSITION]), float(reading[R_VELOCITY]),
-                   float(reading[R_CURRENT]), float(reading[R_EFFORT]), float(reading[R_FORCE]),
-                   joints[:N_JOINTS], joints[N_JOINTS:])
+        joints = reading[R_JOINTS : R_JOINTS + 2 * N_JOINTS].copy()
+        return cls(
+            float(reading[R_TIME]),
+            float(reading[R_POSITION]),
+            float(reading[R_VELOCITY]),
+            float(reading[R_CURRENT]),
+            float(reading[R_EFFORT]),
+            float(reading[R_FORCE]),
+            joints[:N_JOINTS],
+            joints[N_JOINTS:],
+        )
 
 
 class Plant(Protocol):

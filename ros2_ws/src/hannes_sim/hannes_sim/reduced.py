@@ -17,12 +17,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import cfunc
-from numpy.typing import NDArray
-
 from hannes_description.errors import HannesError
 from hannes_description.joints import JOINT_LIMITS, JOINT_NAMES
 from hannes_description.model import Model
+from numba import cfunc
+from numpy.typing import NDArray
 
 from .effect import BoundEffects
 from .motor import begin_step, dry_friction, evaluate_effects, motor_torque, sense
@@ -30,16 +29,75 @@ from .native import ADVANCE_SIGNATURE, pointer_f8
 from .objects import GraspObject
 from .plant import DEFAULT_DT, PlantDiverged, Reading
 from .ports import (
-    COMPLIANCE, CONTACT, DAMPING, DELAY_RING, FRICTION, H_INPUTS, H_OUTPUTS, H_PARAMETERS, H_READING, H_STATE, INERTIA,
-    LOAD, LOAD_DAMPING, LOAD_FRICTION, LOAD_TORQUE, N_HANDLE_COMMON, N_INPUTS, N_JOINTS, N_OUTPUTS, N_PARAMETERS_COMMON,
-    N_READING, N_STATE_COMMON, OBJECT_DAMPING, P_CURRENT_OFFSET, P_DELAY, P_DT, P_EFFICIENCY, P_INDUCTANCE, P_INERTIA,
-    P_KT, P_KT_NOMINAL, P_RATIO, P_RESISTANCE, P_RESOLUTION, P_SUPPLY, P_ZERO, QL, R_FORCE, R_JOINTS, R_LOAD, R_Q, R_QL,
-    R_WARNING, S_CONTACT, S_LOAD, S_TIME_STEPS, SLACK, TORQUE, VL,
+    COMPLIANCE,
+    CONTACT,
+    DAMPING,
+    DELAY_RING,
+    FRICTION,
+    H_INPUTS,
+    H_OUTPUTS,
+    H_PARAMETERS,
+    H_READING,
+    H_STATE,
+    INERTIA,
+    LOAD,
+    LOAD_DAMPING,
+    LOAD_FRICTION,
+    LOAD_TORQUE,
+    N_HANDLE_COMMON,
+    N_INPUTS,
+    N_JOINTS,
+    N_OUTPUTS,
+    N_PARAMETERS_COMMON,
+    N_READING,
+    N_STATE_COMMON,
+    OBJECT_DAMPING,
+    P_CURRENT_OFFSET,
+    P_DELAY,
+    P_DT,
+    P_EFFICIENCY,
+    P_INDUCTANCE,
+    P_INERTIA,
+    P_KT,
+    P_KT_NOMINAL,
+    P_RATIO,
+    P_RESISTANCE,
+    P_RESOLUTION,
+    P_SUPPLY,
+    P_ZERO,
+    QL,
+    R_FORCE,
+    R_JOINTS,
+    R_LOAD,
+    R_Q,
+    R_QL,
+    R_WARNING,
+    S_CONTACT,
+    S_LOAD,
+    S_TIME_STEPS,
+    SLACK,
+    TORQUE,
+    VL,
 )  # fmt: skip
 
 # Parameters of this plant, after the common ones
-_COULOMB, _VISCOUS, _WIRE_K, _WIRE_B, _J_LOAD, _PRELOAD, _STIFFNESS, _LOAD_COULOMB, _LOAD_VISCOUS, _TRAVEL, _STOP_K, \
-    _OBJECT_K, _OBJECT_B, _OBJECT_AT, _TIP = range(N_PARAMETERS_COMMON, N_PARAMETERS_COMMON + 15)
+(
+    _COULOMB,
+    _VISCOUS,
+    _WIRE_K,
+    _WIRE_B,
+    _J_LOAD,
+    _PRELOAD,
+    _STIFFNESS,
+    _LOAD_COULOMB,
+    _LOAD_VISCOUS,
+    _TRAVEL,
+    _STOP_K,
+    _OBJECT_K,
+    _OBJECT_B,
+    _OBJECT_AT,
+    _TIP,
+) = range(N_PARAMETERS_COMMON, N_PARAMETERS_COMMON + 15)
 _N_PARAMETERS = N_PARAMETERS_COMMON + 15
 
 # States of this plant, after the common ones
@@ -79,7 +137,9 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
                 force -= p[_STOP_K] * (ql - p[_TRAVEL])
             damping = p[_LOAD_VISCOUS] + y[LOAD_DAMPING]
             inertia = p[_J_LOAD] + dt * damping
-            vl = dry_friction((p[_J_LOAD] * vl + dt * force) / inertia, p[_LOAD_COULOMB] + y[LOAD_FRICTION], inertia, dt)
+            vl = dry_friction(
+                (p[_J_LOAD] * vl + dt * force) / inertia, p[_LOAD_COULOMB] + y[LOAD_FRICTION], inertia, dt
+            )
             ql += dt * vl
         else:
             ql, vl, load = q, v, 0.0
@@ -101,16 +161,35 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
 _compiled = cfunc(ADVANCE_SIGNATURE, cache=True)(_advance)
 
 # Finger joints of the closed hand; the long fingers' abduction is passive and stays in the middle.
-_CLOSED = np.array([0.0 if name.endswith("_abd") and not name.startswith("thumb") else JOINT_LIMITS[name].upper
-                    for name in JOINT_NAMES])
+_CLOSED = np.array(
+    [
+        0.0 if name.endswith("_abd") and not name.startswith("thumb") else JOINT_LIMITS[name].upper
+        for name in JOINT_NAMES
+    ]
+)
 
 _NAMES = {
-    "supply.voltage": P_SUPPLY, "motor.resistance": P_RESISTANCE, "motor.inductance": P_INDUCTANCE, "motor.kt": P_KT,
-    "gear.ratio": P_RATIO, "gear.efficiency": P_EFFICIENCY, "encoder.resolution": P_RESOLUTION,
-    "encoder.zero": P_ZERO, "current.offset": P_CURRENT_OFFSET, "command.delay": P_DELAY, "friction.coulomb": _COULOMB,
-    "friction.viscous": _VISCOUS, "wire.stiffness": _WIRE_K, "wire.damping": _WIRE_B, "hand.inertia": _J_LOAD,
-    "hand.preload": _PRELOAD, "hand.stiffness": _STIFFNESS, "hand.coulomb": _LOAD_COULOMB,
-    "hand.viscous": _LOAD_VISCOUS, "hand.travel": _TRAVEL, "hand.stop_stiffness": _STOP_K,
+    "supply.voltage": P_SUPPLY,
+    "motor.resistance": P_RESISTANCE,
+    "motor.inductance": P_INDUCTANCE,
+    "motor.kt": P_KT,
+    "gear.ratio": P_RATIO,
+    "gear.efficiency": P_EFFICIENCY,
+    "encoder.resolution": P_RESOLUTION,
+    "encoder.zero": P_ZERO,
+    "current.offset": P_CURRENT_OFFSET,
+    "command.delay": P_DELAY,
+    "friction.coulomb": _COULOMB,
+    "friction.viscous": _VISCOUS,
+    "wire.stiffness": _WIRE_K,
+    "wire.damping": _WIRE_B,
+    "hand.inertia": _J_LOAD,
+    "hand.preload": _PRELOAD,
+    "hand.stiffness": _STIFFNESS,
+    "hand.coulomb": _LOAD_COULOMB,
+    "hand.viscous": _LOAD_VISCOUS,
+    "hand.travel": _TRAVEL,
+    "hand.stop_stiffness": _STOP_K,
     "hand.fingertip_travel": _TIP,
 }
 _OBJECT_NAMES = {"object.stiffness": _OBJECT_K, "object.damping": _OBJECT_B, "object.position": _OBJECT_AT}
@@ -131,8 +210,18 @@ class ReducedPlant:
         self._outputs = np.zeros(N_OUTPUTS)
         self._delay = np.zeros(DELAY_RING)
         self.handle: NDArray[np.int64] = np.zeros(N_HANDLE_COMMON, dtype=np.int64)
-        self.handle[:] = [a.ctypes.data for a in (self.parameters, self.states, self.reading, self._inputs,
-                                                  self._outputs, self.effects.table, self._delay)]
+        self.handle[:] = [
+            a.ctypes.data
+            for a in (
+                self.parameters,
+                self.states,
+                self.reading,
+                self._inputs,
+                self._outputs,
+                self.effects.table,
+                self._delay,
+            )
+        ]
         self.address: int = _compiled.address
         self._call = _compiled.ctypes
         self._handle_pointer = self.handle.ctypes.data_as(self._call.argtypes[0])
@@ -172,7 +261,9 @@ class ReducedPlant:
             effect, parameter = name.split(".", 1)
             self.effects.set(effect, parameter, value)
         else:
-            raise HannesError(f"The reduced plant has no parameter '{name}'; valid are {', '.join(self.names)}.")
+            raise HannesError(
+                f"The reduced plant has no parameter '{name}'; valid are {', '.join(self.names)}."
+            )
         self._update_inertia()
 
     def get(self, name: str) -> float:
@@ -198,8 +289,8 @@ class ReducedPlant:
     def _joints(self) -> None:
         share = self.reading[R_QL] / self.parameters[_TRAVEL] if self.parameters[_TRAVEL] > 0.0 else 0.0
         rate = self.states[_SVL] / self.parameters[_TRAVEL] if self.parameters[_TRAVEL] > 0.0 else 0.0
-        self.reading[R_JOINTS:R_JOINTS + N_JOINTS] = share * _CLOSED
-        self.reading[R_JOINTS + N_JOINTS:] = rate * _CLOSED
+        self.reading[R_JOINTS : R_JOINTS + N_JOINTS] = share * _CLOSED
+        self.reading[R_JOINTS + N_JOINTS :] = rate * _CLOSED
 
     def advance(self, voltage: float, steps: int) -> None:
         self._call(self._handle_pointer, voltage, steps)
@@ -209,8 +300,10 @@ class ReducedPlant:
     def check(self) -> None:
         if self.reading[R_WARNING] != 0.0:
             which = "motor pulley" if not math.isfinite(self.reading[R_Q]) else "hand coordinate"
-            raise PlantDiverged(f"The reduced plant diverged at t = {self.states[S_TIME_STEPS] * self.dt:.4f} s "
-                                f"({which}); reduce dt or check the parameters' magnitudes.")
+            raise PlantDiverged(
+                f"The reduced plant diverged at t = {self.states[S_TIME_STEPS] * self.dt:.4f} s "
+                f"({which}); reduce dt or check the parameters' magnitudes."
+            )
 
     def read(self) -> Reading:
         return Reading.of(self.reading)

@@ -7,9 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numba import cfunc, njit, types
-from numpy.typing import NDArray
-
 from hannes_description.control_ports import (
     C_CURRENT,
     C_PERIOD,
@@ -20,6 +17,8 @@ from hannes_description.control_ports import (
     N_CONTROL_INPUTS,
 )
 from hannes_description.errors import HannesError
+from numba import cfunc, njit
+from numpy.typing import NDArray
 
 from .native import CONTROL_SIGNATURE, call_advance, call_control
 from .plant import Plant
@@ -128,11 +127,11 @@ class Rollout:
 
     @property
     def joint_positions(self) -> Array:
-        return self.raw[:, R_JOINTS:R_JOINTS + N_JOINTS]
+        return self.raw[:, R_JOINTS : R_JOINTS + N_JOINTS]
 
     @property
     def joint_velocities(self) -> Array:
-        return self.raw[:, R_JOINTS + N_JOINTS:R_JOINTS + 2 * N_JOINTS]
+        return self.raw[:, R_JOINTS + N_JOINTS : R_JOINTS + 2 * N_JOINTS]
 
     def signal(self, name: str) -> Array:
         """A signal by its canonical name."""
@@ -142,8 +141,17 @@ class Rollout:
         return value
 
 
-ROLLOUT_SIGNALS = ("reference_position", "encoder_position", "encoder_velocity", "motor_current", "motor_voltage",
-                   "motor_effort", "grip_force", "joint_positions", "joint_velocities")
+ROLLOUT_SIGNALS = (
+    "reference_position",
+    "encoder_position",
+    "encoder_velocity",
+    "motor_current",
+    "motor_voltage",
+    "motor_effort",
+    "grip_force",
+    "joint_positions",
+    "joint_velocities",
+)
 
 
 def substeps_of(period: float, dt: float) -> int:
@@ -154,8 +162,9 @@ def substeps_of(period: float, dt: float) -> int:
     return steps
 
 
-def rollout(plant: Plant, controller: Controller, reference: Array, *, reset: bool = True,
-            joints: bool = True) -> Rollout:
+def rollout(
+    plant: Plant, controller: Controller, reference: Array, *, reset: bool = True, joints: bool = True
+) -> Rollout:
     """Run the closed loop over a reference (n,) of one value per control period.
 
     Each tick: read, control, log, advance (the order of the lock-step node graph, which gives the same trajectory).
@@ -175,10 +184,24 @@ def rollout(plant: Plant, controller: Controller, reference: Array, *, reset: bo
     n = reference.size
     out = np.empty((n, N_READING if joints else R_JOINTS))
     voltages = np.empty(n)
-    done = _closed_loop(plant.address, plant.handle, plant.reading, controller.address, np.zeros(N_CONTROL_INPUTS),
-                        controller.parameters, controller.states, reference, controller.period, substeps, out, voltages)
+    done = _closed_loop(
+        plant.address,
+        plant.handle,
+        plant.reading,
+        controller.address,
+        np.zeros(N_CONTROL_INPUTS),
+        controller.parameters,
+        controller.states,
+        reference,
+        controller.period,
+        substeps,
+        out,
+        voltages,
+    )
     plant.check()
     if done < n:
-        raise HannesError(f"The controller returned a non-finite voltage at t = {done * controller.period:.3f} s; "
-                          "check its gains.")
+        raise HannesError(
+            f"The controller returned a non-finite voltage at t = {done * controller.period:.3f} s; "
+            "check its gains."
+        )
     return Rollout(out[:, R_TIME].copy(), reference, voltages, out)

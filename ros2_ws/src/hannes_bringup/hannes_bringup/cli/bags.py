@@ -23,9 +23,24 @@ def record(
     condition: Annotated[str, typer.Option(help="What was done, for instance slow, fast or grasp.")] = "",
     object: Annotated[str, typer.Option(help="What the hand closed on.")] = "",
     topic: TopicOption = None,
+    profile: Annotated[
+        str,
+        typer.Option(help="Drive the hand too: half_sine, ramp_hold or reversals, by a motor_controller."),
+    ] = "",
+    closures: Annotated[int, typer.Option(min=1, help="With --profile: how often.")] = 13,
+    period: Annotated[
+        float, typer.Option(min=0.0, help="With --profile: s of one closure; 0: its own.")
+    ] = 0.0,
+    amplitude: Annotated[
+        float, typer.Option(min=0.0, help="With --profile: rad at the motor pulley; 0: a full closure.")
+    ] = 0.0,
     more: MoreArgument = None,
 ) -> None:
-    """Record the topics of the hand into a bag (MCAP, safe against a crash); Ctrl-C ends it."""
+    """Record the topics of the hand into a bag (MCAP, safe against a crash); Ctrl-C ends it.
+
+    With --profile a motor_controller is started too, which closes the hand that is running (hand_sim, or the real one)
+    along a reference profile; the recording ends with the profile.
+    """
     import json
 
     said = {key: text for key, text in (("condition", condition), ("object", object)) if text}
@@ -34,7 +49,51 @@ def record(
         parameters["metadata"] = json.dumps(said)
     if topic:
         parameters["topics"] = topic
-    _become("recorder", parameters, more or [])
+    if profile:
+        _record_profile(parameters, profile, closures, period, amplitude, more or [])
+    else:
+        _become("recorder", parameters, more or [])
+
+
+SETTLE = 3.0
+"""s in which recorder and controller find the hand before, and in which the last messages come in after a profile."""
+
+
+def _record_profile(
+    recorder: dict[str, Any], profile: str, closures: int, period: float, amplitude: float, more: list[str]
+) -> None:
+    """Recorder and controller as child processes for as long as the profile lasts."""
+    import time
+
+    from hannes_control.reference import make_profile
+
+    from hannes_bringup.environment import require_ros, ros_environment
+    from hannes_bringup.processes import Interrupted, ProcessGroup, raise_on_signals
+    from hannes_bringup.ros2_standin import find_command
+
+    from .run import NODES
+
+    given = {name: value for name, value in (("period", period), ("amplitude", amplitude)) if value > 0.0}
+    seconds = make_profile(profile, closures=closures, **given).size * 1e-3
+    controller: dict[str, Any] = {"reference": profile, "reference_closures": closures}
+    controller |= {f"reference_{name}": value for name, value in given.items()}
+    require_ros()
+    environment = ros_environment()
+    raise_on_signals()
+    with ProcessGroup(lambda text: typer.echo(text, err=True), environment) as group:
+        try:
+            for name, words in (
+                ("recorder", _words(recorder, more)),
+                ("motor_controller", _words(controller, [])),
+            ):
+                group.start(name, [*find_command(NODES[name], name, environment), *words])
+            end = time.monotonic() + SETTLE + seconds
+            while time.monotonic() < end:
+                if len(group.running) < 2:
+                    raise typer.Exit(1)
+                time.sleep(0.1)
+        except Interrupted:
+            typer.echo("interrupted: what was recorded is kept", err=True)
 
 
 def play(
@@ -72,19 +131,26 @@ def recover(
         typer.echo(f"damage: {line}")
 
 
-def _become(executable: str, parameters: dict[str, Any], more: list[str]) -> None:
-    """Turn this process into the node."""
+def _words(parameters: dict[str, Any], more: list[str]) -> list[str]:
+    """Parameters as words for a node's command line."""
     import json
 
-    from hannes_bringup.environment import require_ros, ros_environment
-    from hannes_bringup.ros2_standin import find_command, parse_launch_arguments
+    from hannes_bringup.ros2_standin import parse_launch_arguments
 
-    require_ros()
-    environment = ros_environment()
     words = ["--ros-args"]
     for name, value in parameters.items():
         words += ["-p", f"{name}:={json.dumps(value)}"]
     for name, text in parse_launch_arguments(more).items():
         words += ["-p", f"{name}:={text}"]
+    return words
+
+
+def _become(executable: str, parameters: dict[str, Any], more: list[str]) -> None:
+    """Turn this process into the node."""
+    from hannes_bringup.environment import require_ros, ros_environment
+    from hannes_bringup.ros2_standin import find_command
+
+    require_ros()
+    environment = ros_environment()
     command = find_command("hannes_bags", executable, environment)
-    os.execve(command[0], [*command, *words], environment)
+    os.execve(command[0], [*command, *_words(parameters, more)], environment)

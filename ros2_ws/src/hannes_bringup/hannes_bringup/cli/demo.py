@@ -28,7 +28,9 @@ GRAPH_TIMEOUT = 90.0
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for bags, pictures and the report; made anew.")] = Path("demo_out"),
+    out: Annotated[Path, typer.Option(help="Folder for bags, pictures and the report; made anew.")] = Path(
+        "demo_out"
+    ),
     bags: Annotated[Path, typer.Option(help="Recorded closures to diagnose.")] = Path("bags/recorded_hand"),
     emg: Annotated[str, typer.Option(help="Two-channel EMG recording (.csv); empty for synthetic EMG.")] = "",
     seconds: Annotated[float, typer.Option(min=0.5, help="Simulated seconds of each graph run.")] = 4.0,
@@ -46,12 +48,17 @@ def demo(
         print(f"[{time.monotonic() - began:5.1f} s] {text}", file=sys.stderr, flush=True)
 
     if not bags.exists():
-        raise HannesError(f"No recorded closures at '{bags}': run `hannes demo` in the project's folder, or give --bags.")
+        raise HannesError(
+            f"No recorded closures at '{bags}': run `hannes demo` in the project's folder, or give --bags."
+        )
     _fresh(out)
     graph = {grasp: _run_graph(grasp, out, emg, seconds, say) for grasp in GRASPS}
     picture = _picture(graph, out, say)
-    result = _lab(bags, out, jobs, say) | {"picture": str(picture.resolve()), "seconds": time.monotonic() - began,
-                                           "bags": {g: r.source for g, r in graph.items()}}
+    result = _lab(bags, out, jobs, say) | {
+        "picture": str(picture.resolve()),
+        "seconds": time.monotonic() - began,
+        "bags": {g: r.source for g, r in graph.items()},
+    }
     if json:
         print_json(result)
         return
@@ -78,26 +85,55 @@ def _run_graph(grasp: str, out: Path, emg: str, seconds: float, say: Callable[[s
 
     bag, log = out / f"graph_{grasp}", out / f"graph_{grasp}.log"
     say(f"node graph in lock-step, object: {grasp} ({seconds:g} s simulated, plant: MuJoCo)")
-    command = [sys.executable, "-m", "hannes_bringup.cli", "run", "graph", "--clock", "lockstep", "--object", grasp,
-               "--model", GRAPH_MODEL, "--duration", str(seconds), "--record", str(bag), "--emg", emg]
+    command = [
+        sys.executable,
+        "-m",
+        "hannes_bringup.cli",
+        "run",
+        "graph",
+        "--clock",
+        "lockstep",
+        "--object",
+        grasp,
+        "--model",
+        GRAPH_MODEL,
+        "--duration",
+        str(seconds),
+        "--record",
+        str(bag),
+        "--emg",
+        emg,
+    ]
     with open(log, "wb") as file:
         try:
-            done = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
-                                  timeout=GRAPH_TIMEOUT, check=False)
+            done = subprocess.run(
+                command,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                timeout=GRAPH_TIMEOUT,
+                check=False,
+            )
         except subprocess.TimeoutExpired:
-            raise HannesError(f"The node graph did not finish within {GRAPH_TIMEOUT:g} s; see {log}.") from None
+            raise HannesError(
+                f"The node graph did not finish within {GRAPH_TIMEOUT:g} s; see {log}."
+            ) from None
     if done.returncode != 0:
         last = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        raise HannesError(f"The node graph ended with code {done.returncode}; see {log}. Last line: "
-                          f"{last[-1] if last else '(none)'}")
+        raise HannesError(
+            f"The node graph ended with code {done.returncode}; see {log}. Last line: "
+            f"{last[-1] if last else '(none)'}"
+        )
     recording = read_bag(bag)
     recording.require(["motor_current", "encoder_position", "reference_position", "stiffness_label"])
     current = recording["motor_current"].values
     labels = Counter(str(label) for label in recording["stiffness_label"].values)
     force = recording["grip_force"].values.max() if "grip_force" in recording else float("nan")
-    say(f"  recorded {sum(c.time.size for c in recording.channels.values())} samples; largest current "
+    say(
+        f"  recorded {sum(c.time.size for c in recording.channels.values())} samples; largest current "
         f"{current.max():.2f} A, grip force {force:.1f} N; classifier: "
-        + ", ".join(f"{label} {100 * n / labels.total():.0f} %" for label, n in labels.most_common()))
+        + ", ".join(f"{label} {100 * n / labels.total():.0f} %" for label, n in labels.most_common())
+    )
     return recording
 
 
@@ -119,16 +155,23 @@ def _picture(graph: dict[str, Recording], out: Path, say: Callable[[str], None])
             axis = figure.add_subplot(top[k])
             axis.imshow(image)
             axis.set_axis_off()
-            axis.set_title({"none": "nothing", "soft": "soft ball", "rigid": "dynamometer"}[grasp],
-                           color=colours[grasp], fontweight="bold")
+            axis.set_title(
+                {"none": "nothing", "soft": "soft ball", "rigid": "dynamometer"}[grasp],
+                color=colours[grasp],
+                fontweight="bold",
+            )
     lower = grid[-1].subgridspec(1, 2)
     position, current = figure.add_subplot(lower[0]), figure.add_subplot(lower[1])
     for grasp, recording in graph.items():
         state, amps = recording["encoder_position"], recording["motor_current"]
-        position.plot(state.time, state.values, color=colours[grasp], label={"none": "nothing"}.get(grasp, grasp))
+        position.plot(
+            state.time, state.values, color=colours[grasp], label={"none": "nothing"}.get(grasp, grasp)
+        )
         current.plot(amps.time, amps.values, color=colours[grasp], lw=0.9)
     reference = graph["none"]["reference_position"]
-    position.plot(reference.time, reference.values, color="black", lw=0.9, ls="--", label="reference from EMG")
+    position.plot(
+        reference.time, reference.values, color="black", lw=0.9, ls="--", label="reference from EMG"
+    )
     position.set(xlabel="time / s", ylabel="encoder position / rad at the pulley")
     current.set(xlabel="time / s", ylabel="motor current / A")
     position.legend(frameon=False, fontsize=9)
@@ -155,7 +198,9 @@ def _hand_images(graph: dict[str, Recording], say: Callable[[str], None]) -> dic
             if "joint_positions" not in recording:
                 return {}
             joints = np.asarray(recording["joint_positions"].values, dtype=float)
-            with HandRenderer(model.parameters, model.variant, named_object(grasp), width=700, height=640) as renderer:
+            with HandRenderer(
+                model.parameters, model.variant, named_object(grasp), width=700, height=640
+            ) as renderer:
                 images[grasp] = renderer.draw(joints[int(np.argmax(joints.sum(axis=1)))])
     except HannesError as error:
         say(f"  no pictures of the hand: {error}")
@@ -176,10 +221,16 @@ def _lab(bags: Path, out: Path, jobs: int, say: Callable[[str], None]) -> dict[s
     prepared = prepare(trials, Model.load("nominal"))
     before = compare(prepared)
     failing = sum(cell.fails for cell in before.cells)
-    say(f"  compare: the nominal model misses by {before.overall:.1f} times the repeatability; "
-        f"{failing} of {len(before.cells)} cells fail")
-    found = diagnose(prepared, effect_sources(model=prepared.model), jobs=jobs,
-                     progress=_throttled(lambda text: say(f"  diagnose: {text}")))
+    say(
+        f"  compare: the nominal model misses by {before.overall:.1f} times the repeatability; "
+        f"{failing} of {len(before.cells)} cells fail"
+    )
+    found = diagnose(
+        prepared,
+        effect_sources(model=prepared.model),
+        jobs=jobs,
+        progress=_throttled(lambda text: say(f"  diagnose: {text}")),
+    )
     say(f"  verdict: {found.verdict}: {', '.join(e.name for e in found.effects) or '-'}")
     for fall in found.falls:
         say(f"    {fall.added:<24} held-out error {fall.held_out:6.2f} times the repeatability")
@@ -187,10 +238,21 @@ def _lab(bags: Path, out: Path, jobs: int, say: Callable[[str], None]) -> dict[s
     model = with_provenance(replace(found.model, name="my_hand"), prepared, found.falls, command)
     path = model.save(out / "my_hand.yaml")
     after = compare(replace(prepared, model=found.model), values=found.values)
-    report = write_report(out / "report.html", comparison=before.to_dict(), after=after.to_dict(),
-                          diagnosis=found.to_dict(), title="Hannes: model against a recorded hand", command=command)
-    return {"summary": found.summary, "verdict": found.verdict, "effects": [e.name for e in found.effects],
-            "model": str(path.resolve()), "report": str(Path(report).resolve())}
+    report = write_report(
+        out / "report.html",
+        comparison=before.to_dict(),
+        after=after.to_dict(),
+        diagnosis=found.to_dict(),
+        title="Hannes: model against a recorded hand",
+        command=command,
+    )
+    return {
+        "summary": found.summary,
+        "verdict": found.verdict,
+        "effects": [e.name for e in found.effects],
+        "model": str(path.resolve()),
+        "report": str(Path(report).resolve()),
+    }
 
 
 def _throttled(say: Callable[[str], None], every: float = 2.0) -> Callable[[int, int, str], None]:

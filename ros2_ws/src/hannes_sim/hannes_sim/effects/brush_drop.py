@@ -15,9 +15,7 @@ class BrushDrop(Effect):
 
     name = "brush_drop"
     title = "brush voltage drop"
-    parameters = (
-        EffectParameter("voltage", "V", 0.0, 2.0, 0.3, 0.0, "drop V_b"),
-    )
+    parameters = (EffectParameter("voltage", "V", 0.0, 2.0, 0.3, 0.0, "drop V_b"),)
     looks_like = "a step of the voltage where the current changes its sign"
     told_by = "slow motion with voltage and current logged"
 

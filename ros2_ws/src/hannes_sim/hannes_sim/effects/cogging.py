@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from ..effect import Effect, EffectParameter
-from ..ports import Q, TORQUE
+from ..ports import TORQUE, Q
 
 
 class Cogging(Effect):
@@ -19,7 +19,16 @@ class Cogging(Effect):
     parameters = (
         EffectParameter("sine", "N.m", -0.1, 0.1, 0.01, 0.0, "amplitude a"),
         EffectParameter("cosine", "N.m", -0.1, 0.1, 0.0, 0.0, "amplitude b"),
-        EffectParameter("period", "rad", 0.05, 30.0, 6.283185307179586, None, "period P at the pulley", starts=(0.3306939635357677, 1.65, 3.14159265, 6.283185307179586, 23.876)),
+        EffectParameter(
+            "period",
+            "rad",
+            0.05,
+            30.0,
+            6.283185307179586,
+            None,
+            "period P at the pulley",
+            starts=(0.3306939635357677, 1.65, 3.14159265, 6.283185307179586, 23.876),
+        ),
     )
     looks_like = "the current wobbles with the angle, at the same angles in every closure and at every speed"
     told_by = "slow closures, current logged fast"

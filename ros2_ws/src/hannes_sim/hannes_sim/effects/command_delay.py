@@ -16,8 +16,16 @@ class CommandDelay(Effect):
     name = "command_delay"
     title = "command delay"
     parameters = (
-        EffectParameter("delay", "s", 0.0, 0.02, 0.002, 0.0, "dead time t_d",
-                        starts=tuple(0.00025 * k for k in range(1, 21))),
+        EffectParameter(
+            "delay",
+            "s",
+            0.0,
+            0.02,
+            0.002,
+            0.0,
+            "dead time t_d",
+            starts=tuple(0.00025 * k for k in range(1, 21)),
+        ),
     )
     looks_like = "overshoot and ringing at sharp changes of the reference; little in slow motion"
     told_by = "fast closures and reversals"

@@ -15,10 +15,10 @@ class CoulombFriction(Effect):
 
     name = "coulomb_friction"
     title = "Coulomb friction"
-    parameters = (
-        EffectParameter("level", "N.m", 0.0, 0.2, 0.01, 0.0, "friction torque F"),
+    parameters = (EffectParameter("level", "N.m", 0.0, 0.2, 0.01, 0.0, "friction torque F"),)
+    looks_like = (
+        "the current is higher by the same amount at every speed, with a step where the motion reverses"
     )
-    looks_like = "the current is higher by the same amount at every speed, with a step where the motion reverses"
     told_by = "two speeds and a slow reversal, with the current logged"
 
     @staticmethod

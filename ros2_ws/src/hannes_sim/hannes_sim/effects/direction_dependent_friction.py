@@ -9,8 +9,8 @@ from ..ports import DAMPING, FRICTION, V
 class DirectionDependentFriction(Effect):
     """Half the difference of dry and viscous friction between the two directions.
 
-    Equation: F = F_0 + c sign(v), B = B_0 + b sign(v): c and b are added while closing and subtracted while opening; the
-    sum with the nominal never becomes negative in the plant.
+    Equation: F = F_0 + c sign(v), B = B_0 + b sign(v): c and b are added while closing and subtracted while
+    opening; the sum with the nominal never becomes negative in the plant.
     Limits: a step at standstill.
     """
 
@@ -18,7 +18,9 @@ class DirectionDependentFriction(Effect):
     title = "direction-dependent friction"
     parameters = (
         EffectParameter("coulomb", "N.m", -0.05, 0.05, 0.005, 0.0, "half the difference of dry friction c"),
-        EffectParameter("viscous", "N.m.s/rad", -0.005, 0.005, 5e-4, 0.0, "half the difference of viscous friction b"),
+        EffectParameter(
+            "viscous", "N.m.s/rad", -0.005, 0.005, 5e-4, 0.0, "half the difference of viscous friction b"
+        ),
     )
     looks_like = "the current is too high in one direction and too low in the other"
     told_by = "closing and opening at two speeds, signed current"

@@ -4,8 +4,7 @@ import math
 from typing import Any
 
 from ..effect import Effect, EffectParameter
-from ..ports import Q, SENSE_POSITION
-
+from ..ports import SENSE_POSITION, Q
 
 ENCODER_RATIO = 3.8  # turns of the pulley per turn of the encoder
 
@@ -13,7 +12,8 @@ ENCODER_RATIO = 3.8  # turns of the pulley per turn of the encoder
 class EncoderEccentricity(Effect):
     """An error of the measured position with the period of the encoder's turn.
 
-    Equation: q_measured = q + a sin(q / 3.8) + b (cos(q / 3.8) - 1): one turn of the encoder is 3.8 turns of the pulley (P09).
+    Equation: q_measured = q + a sin(q / 3.8) + b (cos(q / 3.8) - 1): one turn of the encoder is 3.8 turns of the
+    pulley (P09).
     Limits: first harmonic only.
     """
 
@@ -23,7 +23,10 @@ class EncoderEccentricity(Effect):
         EffectParameter("sine", "rad", -0.5, 0.5, 0.05, 0.0, "amplitude a"),
         EffectParameter("cosine", "rad", -0.5, 0.5, 0.0, 0.0, "amplitude b"),
     )
-    looks_like = "the tracking error and the current wave slowly with the angle, the same in every closure and at every speed"
+    looks_like = (
+        "the tracking error and the current wave slowly with the angle, the same in every closure "
+        "and at every speed"
+    )
     told_by = "slow closures to full travel; compare with the finger joints"
 
     @staticmethod

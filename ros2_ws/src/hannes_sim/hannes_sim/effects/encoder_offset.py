@@ -15,9 +15,7 @@ class EncoderOffset(Effect):
 
     name = "encoder_offset"
     title = "encoder offset"
-    parameters = (
-        EffectParameter("offset", "rad", -2.0, 2.0, 0.3, 0.0, "zero error q_0"),
-    )
+    parameters = (EffectParameter("offset", "rad", -2.0, 2.0, 0.3, 0.0, "zero error q_0"),)
     looks_like = "contact and end stops come at shifted encoder angles"
     told_by = "touch both end stops slowly, from both sides"
 

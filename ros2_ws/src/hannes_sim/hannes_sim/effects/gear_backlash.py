@@ -3,22 +3,20 @@
 from typing import Any
 
 from ..effect import Effect, EffectParameter
-from ..ports import Q, SENSE_POSITION
+from ..ports import SENSE_POSITION, Q
 
 
 class GearBacklash(Effect):
     """The encoder follows the motor through a dead zone (play operator).
 
-    Equation: z stays while |q - z| <= b/2 and follows at the flank otherwise; the encoder shows z (friction holds its shaft
-    in the gap).
+    Equation: z stays while |q - z| <= b/2 and follows at the flank otherwise; the encoder shows z (friction holds
+    its shaft in the gap).
     Limits: no impact at the flanks; the load does not push the encoder's shaft through the gap.
     """
 
     name = "gear_backlash"
     title = "gear backlash"
-    parameters = (
-        EffectParameter("width", "rad", 0.0, 1.0, 0.1, 0.0, "dead zone b at the pulley"),
-    )
+    parameters = (EffectParameter("width", "rad", 0.0, 1.0, 0.1, 0.0, "dead zone b at the pulley"),)
     states = 1
     looks_like = "the measured position rests after every reversal while the motor already turns"
     told_by = "small reversals"

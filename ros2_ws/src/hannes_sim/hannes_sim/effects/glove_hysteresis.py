@@ -18,7 +18,9 @@ class GloveHysteresis(Effect):
     title = "glove viscoelasticity (hysteresis)"
     parameters = (
         EffectParameter("stiffness", "N.m/rad", 0.0, 0.05, 0.004, 0.0, "spring k of the Maxwell element"),
-        EffectParameter("relaxation", "s", 0.02, 20.0, 0.5, None, "relaxation time t_r", starts=(0.1, 0.5, 3.0)),
+        EffectParameter(
+            "relaxation", "s", 0.02, 20.0, 0.5, None, "relaxation time t_r", starts=(0.1, 0.5, 3.0)
+        ),
     )
     states = 1
     looks_like = "more current while closing, less while holding: the torque relaxes while the hand rests"

@@ -19,7 +19,9 @@ class GloveStiffness(Effect):
         EffectParameter("stiffness", "N.m/rad", 0.0, 0.05, 0.002, 0.0, "linear part k"),
         EffectParameter("hardening", "N.m/rad3", 0.0, 5e-4, 5e-6, 0.0, "cubic part h"),
     )
-    looks_like = "the current grows with the closing angle, most at the end of the closure, and drives the opening"
+    looks_like = (
+        "the current grows with the closing angle, most at the end of the closure, and drives the opening"
+    )
     told_by = "closures with and without the glove"
 
     @staticmethod

@@ -6,7 +6,6 @@ from typing import Any
 from ..effect import Effect, EffectParameter
 from ..ports import LOAD_TORQUE, QL
 
-
 FINGER_PER_PULLEY = 0.098
 """rad of metacarpophalangeal flexion per rad of pulley."""
 
@@ -14,8 +13,8 @@ FINGER_PER_PULLEY = 0.098
 class Gravity(Effect):
     """Gravity torque of the fingers at the pulley.
 
-    Equation: tau = -(g_c cos(a ql) + g_s sin(a ql)), a = 0.098 rad of finger per rad of pulley (82 degrees of MCP over 14.6 rad).
-    g_c: palm down or up, g_s: fingers up or down.
+    Equation: tau = -(g_c cos(a ql) + g_s sin(a ql)), a = 0.098 rad of finger per rad of pulley (82 degrees of MCP
+    over 14.6 rad). g_c: palm down or up, g_s: fingers up or down.
     Limits: all fingers as one pendulum; the MuJoCo plant has the real masses.
     """
 

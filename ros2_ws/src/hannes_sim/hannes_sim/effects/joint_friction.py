@@ -9,16 +9,14 @@ from ..ports import LOAD_FRICTION
 class JointFriction(Effect):
     """Torque of constant size against the motion of the hand, behind the wire.
 
-    Equation: |tau| <= F (Coulomb) on the load side.  While the wire is taut it looks like friction of the motor side; while
-    the hand opens, the springs must overcome it, so the wire goes slack earlier.
+    Equation: |tau| <= F (Coulomb) on the load side.  While the wire is taut it looks like friction of the motor
+    side; while the hand opens, the springs must overcome it, so the wire goes slack earlier.
     Limits: one level for all joints.
     """
 
     name = "joint_friction"
     title = "Coulomb friction of joints and guides"
-    parameters = (
-        EffectParameter("level", "N.m", 0.0, 0.2, 0.01, 0.0, "friction torque F at the pulley"),
-    )
+    parameters = (EffectParameter("level", "N.m", 0.0, 0.2, 0.01, 0.0, "friction torque F at the pulley"),)
     looks_like = "as Coulomb friction while closing, but the motor runs ahead of the hand while opening"
     told_by = "a slow opening with the finger joints or the grip force logged"
 

@@ -9,7 +9,8 @@ from ..ports import FRICTION, LOAD
 class LoadDependentFriction(Effect):
     """Friction of the wire over pulleys and guides in proportion to its tension.
 
-    Equation: F = mu |T r| (Euler-Eytelwein for small wrap x friction: exp(mu a) - 1 ~ mu a), T r the transmitted torque.
+    Equation: F = mu |T r| (Euler-Eytelwein for small wrap x friction: exp(mu a) - 1 ~ mu a), T r the transmitted
+    torque.
     Limits: one lumped coefficient for all pulleys; the tension of the last step.
     """
 
@@ -18,7 +19,10 @@ class LoadDependentFriction(Effect):
     parameters = (
         EffectParameter("coefficient", "1", 0.0, 1.0, 0.1, 0.0, "friction torque over transmitted torque"),
     )
-    looks_like = "the current is higher while gripping and lower while letting go, in proportion to the load; nothing changes on void"
+    looks_like = (
+        "the current is higher while gripping and lower while letting go, in proportion to the "
+        "load; nothing changes on void"
+    )
     told_by = "grasp of a stiff object, closing and opening, current logged"
 
     @staticmethod

@@ -15,10 +15,10 @@ class ReturnPreload(Effect):
 
     name = "return_preload"
     title = "return-spring preload shift"
-    parameters = (
-        EffectParameter("torque", "N.m", -0.05, 0.05, 0.01, 0.0, "added preload M at the pulley"),
+    parameters = (EffectParameter("torque", "N.m", -0.05, 0.05, 0.01, 0.0, "added preload M at the pulley"),)
+    looks_like = (
+        "more current while closing and less braking while opening, the same at all angles and speeds"
     )
-    looks_like = "more current while closing and less braking while opening, the same at all angles and speeds"
     told_by = "closing and opening at one slow speed, signed current"
 
     @staticmethod

@@ -18,9 +18,13 @@ class StribeckFriction(Effect):
     title = "Stribeck (breakaway) friction"
     parameters = (
         EffectParameter("stiction", "N.m", 0.0, 0.2, 0.01, 0.0, "extra friction at rest F_s"),
-        EffectParameter("velocity", "rad/s", 0.05, 20.0, 1.0, None, "Stribeck velocity v_s", starts=(0.3, 1.0, 4.0)),
+        EffectParameter(
+            "velocity", "rad/s", 0.05, 20.0, 1.0, None, "Stribeck velocity v_s", starts=(0.3, 1.0, 4.0)
+        ),
     )
-    looks_like = "the start is late and jerky, the current peaks before the motion; slow motion sticks and slips"
+    looks_like = (
+        "the start is late and jerky, the current peaks before the motion; slow motion sticks and slips"
+    )
     told_by = "slow reversals: several starts from rest"
 
     @staticmethod

@@ -15,7 +15,9 @@ class ViscousFriction(Effect):
     name = "viscous_friction"
     title = "viscous friction"
     parameters = (EffectParameter("coefficient", "N.m.s/rad", 0.0, 0.02, 1e-3, 0.0, "viscous coefficient B"),)
-    looks_like = "the current is higher in both directions in proportion to the speed; fast closures show it most"
+    looks_like = (
+        "the current is higher in both directions in proportion to the speed; fast closures show it most"
+    )
     told_by = "the same closure at two speeds, with the current logged"
 
     @staticmethod

@@ -15,9 +15,7 @@ class WireElasticity(Effect):
 
     name = "wire_elasticity"
     title = "wire elasticity"
-    parameters = (
-        EffectParameter("compliance", "rad/(N.m)", 0.0, 30.0, 2.0, 0.0, "added compliance c"),
-    )
+    parameters = (EffectParameter("compliance", "rad/(N.m)", 0.0, 30.0, 2.0, 0.0, "added compliance c"),)
     looks_like = "the motor runs on while the grip builds up: a stiff object feels softer"
     told_by = "grasp of a stiff object at two currents"
 
