@@ -242,8 +242,9 @@ def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:
                                  for f in falls for s in f.get("signals", [])))
     table: list[dict[str, Any]] = []
     for c, s, u in signals:
-        steps = [next((e for e in f.get("signals", []) if (e.get("condition"), e.get("signal")) == (c, s)), {})
-                 for f in falls]
+        steps: list[Part] = [
+            next((e for e in f.get("signals", []) if (e.get("condition"), e.get("signal")) == (c, s)), {})
+            for f in falls]
         table.append({"condition": c, "signal": s, "unit": u, "steps": steps})
     marks = text.log_ticks(start, stop) if log else text.ticks(start, stop)
     return {"rows": rows, "log": log, "floor": place(1.0), "conditions": conditions, "table": table,
@@ -362,17 +363,20 @@ def ranking(diagnosis: Part | None) -> dict[str, Any] | None:
     rows = _list(diagnosis, "ranking")
     if diagnosis is None or not rows:
         return None
-    critical = text.known((diagnosis.get("costs") or {}).get("critical"))
+    critical, nominal = (text.known((diagnosis.get("costs") or {}).get(k)) for k in ("critical", "nominal_fitted"))
+    # Below the critical value there is no misfit to share out: percentages of it would say nothing.
+    excess = critical is None or nominal is None or nominal > critical
     found = {str(e.get("name")) for e in _list(diagnosis, "effects")}
     out = []
     for row in rows:
-        cost, share = text.known(row.get("cost")), text.known(row.get("explained"))
+        cost, share = text.known(row.get("cost")), text.known(row.get("explained")) if excess else None
         out.append({"label": " + ".join(text.words(n) for n in row.get("names", [])), "cost": cost, "explained": share,
                     "of_chance": cost / critical if cost is not None and critical else None,
                     "width": round(100.0 * min(1.0, max(0.0, share or 0.0)), 2),
                     "found": set(row.get("names", [])) <= found and bool(found)})
     return {"first": out[:RANKS], "rest": out[RANKS:], "critical": critical,
-            "draws": (diagnosis.get("chance") or {}).get("draws"), "excess": any(r["explained"] for r in out)}
+            "draws": (diagnosis.get("chance") or {}).get("draws"), "excess": excess,
+            "nominal": nominal / critical if nominal is not None and critical else None}
 
 
 def metric_groups(comparison: Part | None, after: Part | None) -> list[dict[str, Any]]:

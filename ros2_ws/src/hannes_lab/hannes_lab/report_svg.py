@@ -18,7 +18,7 @@ Values = Sequence[float | None]
 LEFT, RIGHT, TOP, GAP, BOTTOM = 46.0, 8.0, 20.0, 16.0, 22.0
 """Margins of the overlay's plots, in the units of its view box."""
 
-WIDTH, MAIN, RESIDUAL = 560.0, 190.0, 80.0
+WIDTH, MAIN, RESIDUAL = 440.0, 170.0, 74.0
 
 
 class Scale:
@@ -130,7 +130,7 @@ def overlay_svg(overlay: Mapping[str, Any], after: Mapping[str, Any] | None) -> 
             out.append(Markup('<line class="grid" x1="{}" x2="{}" y1="{:.1f}" y2="{:.1f}"/>'
                               '<text class="tick-y" x="{}" y="{:.1f}">{}</text>').format(
                 LEFT, WIDTH - RIGHT, scale(value), scale(value), LEFT - 5.0, scale(value) + 3.5, tick_text(value)))
-    for value in ticks(x.low, x.high, 6):
+    for value in ticks(x.low, x.high, 5):
         out.append(Markup('<text class="tick-x" x="{:.1f}" y="{}">{}</text>').format(
             x(value), bottom + 15.0, tick_text(value)))
     out.append(Markup('<text class="tick-x" x="{}" y="{}">s</text>').format(WIDTH - RIGHT, bottom + 15.0))
