@@ -141,6 +141,8 @@ def find_closures(reference: Array, period: float, *, lead: float = 0.03) -> lis
 
     A closure starts `lead` seconds before the reference has moved by 2 % of its span and lasts until the next one
     starts (the rest after it belongs to it: the hand is still opening), at most as long again as its moving part.
+    A stretch in which the recording begins or ends while the reference moves is given with its end at its start: it is
+    no closure.
     """
     span = float(np.ptp(reference))
     if span <= 0.0:
@@ -150,6 +152,9 @@ def find_closures(reference: Array, period: float, *, lead: float = 0.03) -> lis
     out = []
     for k, (first, last) in enumerate(starts):
         begin = first - lead
+        if first <= 0.0 or last >= (reference.size - 1) * period:
+            out.append((begin, begin))
+            continue
         end = starts[k + 1][0] - lead if k + 1 < len(starts) else (reference.size - 1) * period
         out.append((begin, min(end, last + (last - first))))
     return out

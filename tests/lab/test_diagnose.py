@@ -1,0 +1,140 @@
+"""The lab blind: the tests hold the truth, the lab gets recordings only."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hannes_description.model import Model
+from hannes_lab.add import add_effects
+from hannes_lab.compare import compare
+from hannes_lab.diagnose import Diagnosis, diagnose, effect_sources
+from hannes_lab.hide import Truth, make_set, strength_of
+from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.trials import make_trial
+from hannes_sim.effect import load_effect
+
+CLOSURES = 8
+
+OUTSIDE = '''
+import math
+from hannes_sim.effect import Effect, EffectParameter
+from hannes_sim.ports import LOAD_TORQUE, QL, VL
+
+
+class Flap(Effect):
+    """A latch that holds the fingers in the middle of their travel and lets go."""
+
+    name = "latch"
+    parameters = (EffectParameter("torque", "N.m", 0.0, 1.0, 0.05, 0.0, "peak torque"),)
+
+    @staticmethod
+    def contribute(x, p, s, y):
+        u = (x[QL] - 6.0) / 0.5
+        y[LOAD_TORQUE] -= p[0] * u * math.exp(-u * u)
+'''
+
+
+def data(effects: list[str], seed: int, factor: float = 1.0) -> tuple[Prepared, Truth]:
+    model = Model.load()
+    recordings, truth = make_set(
+        model, [strength_of(e, factor) for e in effects], seed=seed, closures=CLOSURES
+    )
+    return prepare([make_trial(r) for r in recordings], model), truth
+
+
+def run(prepared: Prepared) -> Diagnosis:
+    return diagnose(prepared, effect_sources(model=prepared.model))
+
+
+def test_nothing_is_missing_in_clean_data() -> None:
+    found = run(data([], seed=101)[0])
+    assert found.verdict == "nothing" and not found.effects
+    assert found.falls[-1].held_out < 1.3
+    assert "Nothing is missing" in found.summary
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "factor"),
+    [("glove_stiffness", 102, 1.0), ("gearbox_inertia", 103, 1.0), ("load_dependent_friction", 104, 1.0)],
+)
+def test_a_hidden_effect_is_named_its_parameter_recovered_and_the_error_falls(
+    name: str, seed: int, factor: float
+) -> None:
+    prepared, truth = data([name], seed, factor)
+    found = run(prepared)
+    assert found.verdict == "effects"
+    assert [e.name for e in found.effects] == [name]
+    assert len(found.tied) <= 2
+    p = load_effect(name).strength().name
+    estimate = found.effects[0].parameters[p]
+    true = truth.effects[0].values[p]
+    assert estimate.low <= true <= estimate.high or estimate.value == pytest.approx(true, rel=0.1)
+    held_out = [fall.held_out for fall in found.falls]
+    assert held_out[-1] <= 1.3 < held_out[0]
+    assert held_out[-1] < held_out[1], "more than the nuisance parameters must be gained"
+
+
+def test_an_effect_outside_the_catalogue_is_called_unknown(tmp_path: Path) -> None:
+    file = tmp_path / "latch.py"
+    file.write_text(OUTSIDE)
+    found = run(data([f"{file}:Flap"], seed=105)[0])
+    assert found.verdict == "unknown"
+    assert "not in the catalogue" in found.summary
+    assert {d.variable for d in found.depends_on} == {"position", "velocity", "direction", "load", "time"}
+
+
+def test_the_users_own_effect_is_a_full_citizen(tmp_path: Path) -> None:
+    """With its file given, the effect outside the catalogue is found and added, and the model file loads again."""
+    file = tmp_path / "latch.py"
+    file.write_text(OUTSIDE)
+    source = f"{file}:Flap"
+    prepared, truth = data([source], seed=105)
+    found = diagnose(prepared, effect_sources([source], model=prepared.model))
+    assert [e.name for e in found.effects] == ["latch"]
+    assert found.effects[0].parameters["torque"].value == pytest.approx(
+        truth.effects[0].values["torque"], rel=0.1
+    )
+    addition = add_effects(prepared, effect_sources(only=[source], model=prepared.model))
+    path = addition.model.save(tmp_path / "my_hand.yaml")
+    loaded = Model.load(path)
+    assert loaded.effects[0].source == f"{file.resolve()}:Flap"
+    assert addition.falls[-1].held_out <= 1.3
+
+
+def test_add_writes_a_model_whose_error_is_low_as_given(tmp_path: Path) -> None:
+    prepared, _ = data(["glove_stiffness"], 106)
+    addition = add_effects(prepared, effect_sources(only=["glove_stiffness"], model=prepared.model))
+    model = Model.load(addition.model.save(tmp_path / "hand.yaml"))
+    before = compare(prepared)
+    after = compare(prepare(prepared.features.trials, model))
+    assert after.overall < 0.5 * before.overall
+    assert model.provenance["bags"] and model.provenance["falls"][-1]["added"] == "glove_stiffness"
+    assert sum(c.fails for c in before.cells) > sum(c.fails for c in after.cells)
+
+
+def test_results_do_not_depend_on_the_number_of_processes() -> None:
+    prepared, _ = data(["wire_elasticity"], 107)
+    only = ["wire_elasticity", "wire_slack", "viscous_friction", "gravity"]
+    one = diagnose(prepared, effect_sources(only=only), jobs=1)
+    two = diagnose(prepare(prepared.features.trials, prepared.model), effect_sources(only=only), jobs=2)
+    assert [r.names for r in one.ranking] == [r.names for r in two.ranking]
+    assert [r.cost for r in one.ranking] == [r.cost for r in two.ranking]
+    assert one.falls[-1].held_out == two.falls[-1].held_out
+
+
+def test_position_alone_works_and_says_what_is_lost() -> None:
+    prepared, _ = data(["glove_stiffness"], 108)
+    alone = prepare(prepared.features.trials, prepared.model, signals=["encoder_position"])
+    assert any("no current" in note for note in alone.notes)
+    found = run(alone)
+    assert found.verdict in ("effects", "unknown")
+    assert np.isfinite(found.falls[-1].held_out)
+
+
+def test_json_has_the_promised_keys() -> None:
+    prepared, _ = data(["glove_stiffness"], 102)
+    content = diagnose(prepared, effect_sources(only=["glove_stiffness", "gravity"])).to_dict()
+    assert set(content) >= {"verdict", "effects", "tied", "experiments", "error", "falls", "depends_on"}
+    assert set(content["error"]) >= {"nominal", "final", "repeatability", "held_out"}
+    assert set(content["effects"][0]["parameters"]["stiffness"]) >= {"value", "low", "high", "unit"}
+    assert set(content["falls"][0]) >= {"added", "train", "held_out"}

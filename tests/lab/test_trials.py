@@ -1,0 +1,98 @@
+"""From recordings to trials: reference on the grid, closures, conditions, outliers."""
+
+import numpy as np
+import pytest
+from hannes_bags.recording import Channel, Recording
+from hannes_control.reference import half_sine
+from hannes_description.errors import HannesError
+from hannes_lab.prepare import without_outliers
+from hannes_lab.trials import find_closures, group_closures, make_trial, reference_on_grid, unique_names
+
+
+def recording(
+    reference: np.ndarray, rate: float, *, metadata: dict[str, object] | None = None, wobble: int = -1
+) -> Recording:
+    """Signals that follow the reference with a lag, logged at 30 Hz; closure `wobble` is disturbed."""
+    time = np.arange(reference.size) * 1e-3
+    at = np.arange(0.0, time[-1], 1.0 / rate)
+    log = np.arange(0.0, time[-1], 1.0 / 30.0)
+    position = np.interp(log - 0.05, time, reference)
+    if wobble >= 0:
+        start = 4.0 * wobble
+        position += np.where((log > start) & (log < start + 2.0), 2.0, 0.0)
+    rng = np.random.default_rng(0)
+    position = position + 1e-3 * rng.standard_normal(log.size)
+    channels = {
+        "reference_position": Channel(at, np.interp(at, time, reference), "rad", "reference_position"),
+        "encoder_position": Channel(log, position, "rad", "encoder_position"),
+        "motor_current": Channel(log, np.abs(position) * 0.02, "A", "motor_current"),
+    }
+    return Recording(channels, metadata or {}, "memory")
+
+
+def test_closures_are_found_and_share_a_condition() -> None:
+    trial = make_trial(recording(half_sine(5), 250.0, metadata={"condition": "slow"}))
+    assert trial.conditions == ("slow",) and len(trial.closures) == 5
+    starts = np.array([c.start for c in trial.closures])
+    assert np.diff(starts) == pytest.approx(4.0, abs=0.01)
+
+
+def test_two_speeds_in_one_bag_are_two_conditions() -> None:
+    reference = np.concatenate([half_sine(3), half_sine(4, period=2.0)])
+    trial = make_trial(recording(reference, 250.0, metadata={"condition": "mix"}))
+    assert len(trial.conditions) == 2
+    assert sorted(len(trial.of(c)) for c in trial.conditions) == [3, 4]
+
+
+def test_a_cut_off_closure_is_left_out_and_said() -> None:
+    trial = make_trial(recording(half_sine(4)[:-2800], 250.0))
+    assert len(trial.closures) == 3
+    assert any("cut off" in note for note in trial.notes)
+
+
+@pytest.mark.parametrize("rate", [30.0, 50.0])
+def test_a_slow_log_of_the_reference_is_filled_smoothly(rate: float) -> None:
+    truth = half_sine(2, amplitude=14.0)
+    time = np.arange(truth.size) * 1e-3
+    at = np.arange(0.013, time[-1], 1.0 / rate)
+    filled, note = reference_on_grid(at, np.interp(at, time, truth), 1e-3, float(time[-1]))
+    error = np.abs(filled[200:] - truth[200 : filled.size])
+    linear = np.abs(np.interp(time[200:], at, np.interp(at, time, truth)) - truth[200:])
+    assert note is not None
+    assert np.sqrt((error**2).mean()) < 0.5 * np.sqrt((linear**2).mean())
+
+
+def test_a_fast_log_is_held_as_the_controller_does() -> None:
+    at = np.arange(0.0, 1.0, 0.01)
+    filled, note = reference_on_grid(at, np.arange(100.0), 1e-3, 0.999)
+    assert note is None and filled[15] == 1.0 and filled[19] == 1.0 and filled[20] == 2.0
+
+
+def test_an_outlier_closure_is_left_out() -> None:
+    trial = without_outliers(make_trial(recording(half_sine(8), 250.0, wobble=3)))
+    assert len(trial.closures) == 7
+    assert not any(abs(c.start - 12.0) < 0.5 for c in trial.closures)
+    assert any("left out" in note for note in trial.notes)
+
+
+def test_no_closure_and_no_signal_are_clear_errors() -> None:
+    with pytest.raises(HannesError, match="no closure was found"):
+        make_trial(recording(np.zeros(4000), 250.0))
+    only = Recording(
+        {"encoder_position": Channel(np.arange(3.0), np.zeros(3), "rad", "encoder_position")}, {}, "x"
+    )
+    with pytest.raises(HannesError, match="reference_position"):
+        make_trial(only)
+
+
+def test_names_of_trials_are_made_unique() -> None:
+    trial = make_trial(recording(half_sine(3), 250.0, metadata={"condition": "slow"}))
+    names = [t.name for t in unique_names([trial, trial])]
+    assert names == ["slow", "slow#2"]
+
+
+def test_grouping_ignores_small_differences_only() -> None:
+    reference = np.concatenate([half_sine(2), 1.01 * half_sine(1), 0.7 * half_sine(1)])
+    spans = find_closures(reference, 1e-3)
+    kinds = {c.condition for c in group_closures(reference, 1e-3, spans, "c")}
+    assert len(spans) == 4 and len(kinds) == 2
