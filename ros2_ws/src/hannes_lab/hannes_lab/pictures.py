@@ -9,12 +9,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 from hannes_description.errors import HannesError
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpecFromSubplotSpec
+from matplotlib.patches import Rectangle
 from matplotlib.transforms import blended_transform_factory
 
 from .report import error_fall, failure_maps, heat, ranking, verdict_of
@@ -55,7 +57,8 @@ def write_picture(path: str | Path, *, comparison: Part | None, after: Part | No
         out.parent.mkdir(parents=True, exist_ok=True)
         # No date inside: the same data give the same file.
         metadata = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}[out.suffix.lower()]
-        figure.savefig(out, dpi=150, metadata=metadata)
+        with mpl.rc_context(STYLE):
+            figure.savefig(out, dpi=150, metadata=metadata)
     except OSError as error:
         raise HannesError(f"The picture cannot be written to '{out}': {error.strerror or error}.") from error
     return out
@@ -64,8 +67,6 @@ def write_picture(path: str | Path, *, comparison: Part | None, after: Part | No
 def draw(*, comparison: Part | None, after: Part | None = None, diagnosis: Part | None = None,
          title: str = "") -> Figure:
     """The figure, on a canvas of its own: nothing global of matplotlib is touched but within this call."""
-    import matplotlib as mpl
-
     if comparison is None:
         comparison, after = after, None
     if comparison is None and diagnosis is None:
@@ -170,8 +171,6 @@ def _heading(figure: Figure, verdict: Mapping[str, Any], title: str, height: flo
 
 
 def _stripe(colour: str) -> Any:
-    from matplotlib.patches import Rectangle
-
     return Rectangle((0.0, 0.0), 0.006, 1.0, facecolor=colour, linewidth=0.0)
 
 
@@ -282,8 +281,6 @@ def _map(axes: Axes, table: Mapping[str, Any], named: bool) -> None:
 
 
 def _cell(x: float, y: float, colour: Any) -> Any:
-    from matplotlib.patches import Rectangle
-
     return Rectangle((x - 0.47, y - 0.45), 0.94, 0.9, facecolor=colour, linewidth=0.0)
 
 

@@ -428,7 +428,7 @@ def _model_names(comparison: Part | None, after: Part | None, diagnosis: Part | 
 
 
 def _models(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> list[dict[str, str]]:
-    rows = [("before", comparison), ("after", after), ("diagnosed", diagnosis)]
+    rows = [("before" if after is not None else "compared", comparison), ("after", after), ("diagnosed", diagnosis)]
     out = [{"role": role, "name": str((part.get("model") or {}).get("name", "")),
             "sha256": str((part.get("model") or {}).get("sha256", ""))} for role, part in rows if part is not None]
     return [m for m in out if m["name"] or m["sha256"]]

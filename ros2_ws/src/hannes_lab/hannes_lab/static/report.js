@@ -90,7 +90,8 @@
     var reference = o.signal === "encoder_position" ? o.reference : null;
     var spread = minus(o.high, o.measured);
     var size = Math.max.apply(null, o.measured.concat(o.model).map(function (v) { return Math.abs(v || 0); })) || 1;
-    var small = Math.max.apply(null, minus(o.measured, o.model).concat(spread).map(function (v) { return Math.abs(v || 0); })) || size;
+    var off = minus(o.measured, o.model), offAfter = after && minus(o.measured, after);
+    var small = Math.max.apply(null, off.concat(spread).map(function (v) { return Math.abs(v || 0); })) || size;
     var runs = phaseRuns(o), self = this, plots = [];
     this.group = figure.dataset.group.replace(/^\d+-/, "");
     this.zoomed = null;
@@ -111,8 +112,8 @@
       values.push(o.measured, o.model);
       if (after) { specs.push(["after", "after", null, "after"]); values.push(after); }
       var rspecs = [["high", null, null, "measured"], ["low", null, null, "measured"], ["before", "before", null, "before"]];
-      var rvalues = [o.time, spread, minus(o.low, o.measured), minus(o.measured, o.model)];
-      if (after) { rspecs.push(["after", "after", null, "after"]); rvalues.push(minus(o.measured, after)); }
+      var rvalues = [o.time, spread, minus(o.low, o.measured), off];
+      if (after) { rspecs.push(["after", "after", null, "after"]); rvalues.push(offAfter); }
       function options(height, specs, top, names, xaxis) {
         return {
           width: width, height: height, legend: { show: false }, padding: [top, 8, 0, 0],
@@ -153,8 +154,8 @@
       if (t == null) { add("", "lower plot: measured − model, " + (o.unit || "") .replace(".", "·")); return; }
       add("", "t = " + t.toFixed(2) + " s", false);
       add("", "measured " + digits(o.measured[k], size) + (spread[k] > 0 ? " ± " + digits(spread[k], small) : ""), true);
-      add("before", (after ? "before " : "model ") + digits(o.model[k], size) + " (residual " + digits(o.measured[k] - o.model[k], small) + ")");
-      if (after) add("after", "after " + digits(after[k], size) + " (residual " + digits(o.measured[k] - after[k], small) + ")");
+      add("before", (after ? "before " : "model ") + digits(o.model[k], size) + " (residual " + digits(off[k], small) + ")");
+      if (after) add("after", "after " + digits(after[k], size) + " (residual " + digits(offAfter[k], small) + ")");
     }
 
     function scale(a, b) { plots.forEach(function (p) { p.setScale("x", { min: a, max: b }); }); }
@@ -209,7 +210,14 @@
     build();
   }
 
-  document.querySelectorAll(".panel").forEach(function (figure) { panels.push(new Panel(figure)); });
+  document.querySelectorAll(".panel").forEach(function (figure) {
+    try {
+      panels.push(new Panel(figure));
+    } catch (error) {
+      figure.classList.add("plain"); /* the drawing without scripts stays */
+      console.error(error);
+    }
+  });
 
   document.querySelectorAll(".toggles button").forEach(function (button) {
     button.addEventListener("click", function () {
