@@ -126,7 +126,7 @@ class Diagnosis:
     depends_on: tuple[Dependence, ...]
     chance: Chance
     costs: Mapping[str, float]
-    nuisances: Mapping[str, Mapping[str, float]]
+    nuisances: Mapping[str, Mapping[str, Any]]
     notes: tuple[str, ...]
     simulations: int
     data: tuple[Mapping[str, Any], ...]
@@ -408,7 +408,7 @@ def error_falls(prepared: Prepared, search: Search, best: Candidate, progress: P
     return tuple(falls)
 
 
-def _nuisance_table(found: Fit) -> dict[str, dict[str, float]]:
+def _nuisance_table(found: Fit) -> dict[str, dict[str, Any]]:
     intervals = intervals_of(found, 1.0)
     return {
         c.name: {
@@ -417,6 +417,7 @@ def _nuisance_table(found: Fit) -> dict[str, dict[str, float]]:
             "prior_sds": float(z),
             "low": intervals[c.name][0],
             "high": intervals[c.name][1],
+            "unit": c.unit,
         }
         for c, z in zip(found.coordinates, found.z, strict=True)
         if c.prior
