@@ -46,8 +46,7 @@ def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple
         return rng.standard_normal((problem.features.size, draws)), False
     raw = np.empty((problem.features.size, draws))
     signs: dict[tuple[str, int], Array] = {}
-    for block, rows in zip(blocks, problem.features.slices, strict=True):
-        deviation = block.measured - block.measured.mean(axis=0)
+    for block, rows, deviation in zip(blocks, problem.features.slices, problem.deviations, strict=True):
         n = block.n
         s = signs.setdefault((block.condition, n), rng.choice([-1.0, 1.0], size=(draws, n)))
         scale = np.sqrt(n / (n - 1.0))

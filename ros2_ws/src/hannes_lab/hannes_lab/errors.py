@@ -46,11 +46,15 @@ class SignalError:
 
 
 def repeatability(block: Block) -> float:
-    """Root mean square scatter of the closures of a block, in its unit; NaN for a single closure."""
-    if block.n < 2:
+    """Root mean square scatter of the closures of a block, in its unit; NaN for a single closure.
+
+    The first of four or more closures is left out: it starts from another state than the others.
+    """
+    closures = block.measured[1:] if block.n >= 4 else block.measured
+    if closures.shape[0] < 2:
         return float("nan")
-    e = block.measured - block.measured.mean(axis=0)
-    return float(np.sqrt((e**2).sum(axis=0).mean() / (block.n - 1)))
+    e = closures - closures.mean(axis=0)
+    return float(np.sqrt((e**2).sum(axis=0).mean() / (closures.shape[0] - 1)))
 
 
 def signal_errors(
@@ -150,7 +154,7 @@ class _Fixed(Problem):
     """A problem in which some parameters are held."""
 
     def __init__(self, problem: Problem, held: Mapping[str, float]) -> None:
-        super().__init__(problem.rig, problem.features, problem.whitener)
+        super().__init__(problem.rig, problem.features, problem.whitener, problem.deviations)
         self._held = dict(held)
 
     def residual(self, model: Model, values: Mapping[str, float]) -> Array:

@@ -115,12 +115,14 @@ def vanishing_entry(
 class Problem:
     """Data, noise and rig of one data set; counts its simulations.
 
-    rows      features that take part (held-out conditions are left out)
+    whitener    per condition, rows of the features and the Cholesky factor of their covariance
+    deviations  per block (n, p), scatter of the closures: what the model does not predict of their differences
     """
 
     rig: Rig
     features: Features
     whitener: tuple[tuple[NDArray[np.int64], Array], ...]
+    deviations: tuple[Array, ...]
     simulations: int = 0
     failures: int = 0
     _measured: Array = field(init=False, repr=False)
@@ -154,13 +156,18 @@ def build_problem(
     Where a condition has a single closure its scatter is that of the priors (closure_sd), and its sample variance is
     taken from the roughness of the curve.
     """
-    deviations = [block.measured - block.measured.mean(axis=0) for block in features.blocks]
+    base = features.closures(rig, model, values)
+    # What the model says of the differences between closures (the first one starts from another state; a motor that
+    # heats up) is no scatter.
+    deviations = [
+        (block.measured - block.measured.mean(axis=0)) - (predicted - predicted.mean(axis=0))
+        for block, predicted in zip(features.blocks, base, strict=True)
+    ]
     variances = []
     for block, e in zip(features.blocks, deviations, strict=True):
         span = float(np.ptp(block.measured)) or 1.0
         floor = (FLOOR * span) ** 2
         variances.append(_sample_variance(block.measured, e) + floor)
-    base = features.closures(rig, model, values)
     columns: list[list[Array]] = []
     scatter_names = [n for n in nuisances if n.closure_sd > 0.0]
     for nuisance in scatter_names:
@@ -192,7 +199,7 @@ def build_problem(
             )
             if rows.size:
                 whitener.append((rows, np.linalg.cholesky(single / count)))
-    return Problem(rig, features, tuple(whitener))
+    return Problem(rig, features, tuple(whitener), tuple(deviations))
 
 
 def _parts(features: Features, own: Sequence[int], n: int) -> list[tuple[list[tuple[int, int, int]], float]]:
