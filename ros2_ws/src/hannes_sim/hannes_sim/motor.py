@@ -26,6 +26,7 @@ from .ports import (
     P_DELAY,
     P_DT,
     P_EFFICIENCY,
+    P_EMF_COMPENSATED,
     P_INDUCTANCE,
     P_KT,
     P_KT_NOMINAL,
@@ -108,12 +109,14 @@ def motor_torque(handle):  # type: ignore[no-untyped-def]
     about 0.1 ms, is shorter than a step); torque = efficiency kt ratio i, with the mean current of the step so that
     the impulse is exact too.  Without inductance the current follows at once.  A dry voltage drop (brushes) is
     solved implicitly, in the proximal form of dry_friction, because at zero current it is steeper than R.
+    An amplifier with a current loop of its own makes up for the back-EMF (compensated = 1): the command is then a
+    current in units of its gain.
     """
     p, s = pointer_f8(handle[H_PARAMETERS]), pointer_f8(handle[H_STATE])
     x, y = pointer_f8(handle[H_INPUTS]), pointer_f8(handle[H_OUTPUTS])
     kt = p[P_KT] * (1.0 + y[KT_REL])
     resistance = p[P_RESISTANCE] * (1.0 + y[RESISTANCE_REL])
-    drive = x[VOLTAGE] - y[VOLTAGE_DROP] - kt * p[P_RATIO] * x[V]
+    drive = x[VOLTAGE] - y[VOLTAGE_DROP] - kt * p[P_RATIO] * x[V] * (1.0 - p[P_EMF_COMPENSATED])
     final = drive / resistance
     before = s[S_CURRENT]
     rate = resistance / p[P_INDUCTANCE] * p[P_DT] if p[P_INDUCTANCE] > 0.0 else math.inf

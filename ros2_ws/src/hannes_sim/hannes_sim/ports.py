@@ -81,7 +81,8 @@ P_ZERO = 9  # rad, encoder zero error
 P_CURRENT_OFFSET = 10  # A, current sensor offset
 P_DELAY = 11  # s, delay of the command
 P_KT_NOMINAL = 12  # N.m/A, what the motor board believes
-N_PARAMETERS_COMMON = 13
+P_EMF_COMPENSATED = 13  # 1, part of the back-EMF that the amplifier makes up for; 0 = voltage drive
+N_PARAMETERS_COMMON = 14
 
 # State that every plant has in common: state[...]
 S_TIME_STEPS = 0  # number of steps since reset (exact in float64)

@@ -56,6 +56,7 @@ from .ports import (
     P_DELAY,
     P_DT,
     P_EFFICIENCY,
+    P_EMF_COMPENSATED,
     P_INDUCTANCE,
     P_INERTIA,
     P_KT,
@@ -173,6 +174,7 @@ _NAMES = {
     "motor.resistance": P_RESISTANCE,
     "motor.inductance": P_INDUCTANCE,
     "motor.kt": P_KT,
+    "motor.emf_compensated": P_EMF_COMPENSATED,
     "gear.ratio": P_RATIO,
     "gear.efficiency": P_EFFICIENCY,
     "encoder.resolution": P_RESOLUTION,
@@ -228,6 +230,8 @@ class ReducedPlant:
 
         self.parameters[P_DT] = dt
         values = model.parameters
+        # A drive without a gearbox, or whose command is a current, need not name these.
+        self.parameters[[P_RATIO, P_EFFICIENCY, P_RESISTANCE]] = 1.0
         for name, index in _NAMES.items():
             if name in values:
                 self.parameters[index] = values.value(name)
