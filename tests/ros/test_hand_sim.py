@@ -76,7 +76,7 @@ def test_real_time_gives_zero_volt_when_commands_stop(peer):
         assert convert.float64_value(peer.heard["motor_current"][-1]) != 0.0
         status = peer.until_status("hand_sim", lambda s: s["command_timeouts"] == "1", "the timeout")
         assert status["applied_voltage"] == "0"
-        assert status["message"] == "command timed out: 0 V"
+        assert status["message"].startswith("command timed out: 0 V")
         # By the node's own clock, so that the load of the machine does not matter here.
         assert float(status["command_age_at_zero_s"]) <= 0.1
         say_voltage(peer, 5.0)

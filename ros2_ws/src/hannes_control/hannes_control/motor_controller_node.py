@@ -11,7 +11,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_ros import convert, topics
 from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
-from hannes_ros.lockstep import Peers, TickJoin
+from hannes_ros.lockstep import SETTLE_S, Peers, TickJoin
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
@@ -80,7 +80,7 @@ class MotorController(HannesNode, LifecycleNode):
         self._state_at = self._current_at = self._reference_at = 0.0
         self._stale = False
         self._start = 0
-        self._answered = -1
+        self._answered = self._heard = -1
         self._period_ns = round(p.period * 1e9)
         self._join = TickJoin(2 if self._profile is not None else 3)
         self._loop: RealtimeLoop | None = None
@@ -111,7 +111,8 @@ class MotorController(HannesNode, LifecycleNode):
         self._clear()
         self._active, self._tripped = True, False
         if self._lockstep:
-            self._answer()
+            if self._join.synchronised:
+                self._answer()
         else:
             self._start = -1
             self._loop = RealtimeLoop(self._p.period, self._step)
@@ -217,19 +218,24 @@ class MotorController(HannesNode, LifecycleNode):
             return
         if sample.stamp_ns < self._answered:  # the simulator began again
             self._join.reset()
-            self._answered = -1
+            self._answered = self._heard = -1
             self._clear()
-        self._state_at = monotonic()
-        self._join.put(0, sample)
-        self._answer()
+        elif sample.stamp_ns == self._heard:  # repeated to a newcomer
+            self._join.rejoin()
+        self._heard = sample.stamp_ns
+        self._put(0, sample)
 
     def _on_tick_current(self, data: bytes) -> None:
-        self._join.put(1, convert.float64_value(data))
-        self._answer()
+        self._put(1, convert.float64_value(data))
 
     def _on_tick_reference(self, data: bytes) -> None:
-        self._join.put(2, convert.float64_value(data))
-        self._answer()
+        self._put(2, convert.float64_value(data))
+
+    def _put(self, slot: int, item: object) -> None:
+        self._state_at = monotonic()
+        self._join.put(slot, item)
+        if self._join.synchronised:
+            self._answer()
 
     def _answer(self) -> None:
         """Answer the tick if all of it is here, the motor is on and the answer will be heard."""
@@ -250,7 +256,8 @@ class MotorController(HannesNode, LifecycleNode):
 
     # -- health ------------------------------------------------------------------------------------------------------
     def _check(self) -> None:
-        if self._lockstep and not self._peers.complete and not self._peers.missing():
+        if self._lockstep and not self._peers.missing() and not self._join.synchronised \
+                and monotonic() - self._state_at >= SETTLE_S:
             self._answer()
         if self._loop is not None and self._loop.error is not None:
             self.fail(f"The control loop stopped: {self._loop.error!r}")

@@ -6,9 +6,9 @@ Only motor/state has a stamp, so the rest is matched by order: every topic is re
 writer, and each node answers each motor/state with exactly one message. The n-th reading, the n-th current and the
 n-th reference that a node receives therefore belong together (`TickJoin`).
 
-Who comes late has not seen all of them. hand_sim repeats a reading only to newcomers while it stands still
-(`StallWatch`), every node answers a repeated stamp with its repeated answer, and a node that starts pairs the newest
-of each until its first answer.
+Who comes late has not seen all of them. While hand_sim stands still and a newcomer is there, it repeats the reading
+(`StallWatch`), and emg_reference repeats its answer. Repeated messages break the pairing by order, so a node that
+starts, or sees a stamp again, pairs the newest of each topic, once none has come for SETTLE_S; then by order again.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ from collections.abc import Callable
 from typing import Any
 
 _GIGA = 1_000_000_000
+
+SETTLE_S = 0.05
+"""s of wall time without a message after which all repetitions of a tick have arrived."""
 
 
 def stamp_of_tick(tick: int, period_ns: int) -> int:
@@ -47,9 +50,18 @@ class TickJoin:
         """Forget everything; pair the newest again."""
         self._queues = [deque(maxlen=1) for _ in range(self._slots)]
 
+    @property
+    def synchronised(self) -> bool:
+        """Whether messages are paired by order, not the newest of each."""
+        return self._queues[0].maxlen is None
+
+    def rejoin(self) -> None:
+        """Messages were repeated: keep the newest of each, and pair the newest until `synchronise`."""
+        self._queues = [deque(queue, maxlen=1) for queue in self._queues]
+
     def synchronise(self) -> None:
         """From here on pair strictly by order."""
-        if self._queues[0].maxlen is not None:
+        if not self.synchronised:
             self._queues = [deque(queue) for queue in self._queues]
 
     def put(self, slot: int, item: Any) -> None:
@@ -105,7 +117,9 @@ class StallWatch:
     def published(self, now: float) -> None:
         """A new tick was published at `now` (s, monotonic)."""
         self._since = self._repeated = now
-        self._newcomer = self.stalled = False
+        # After a stall the newcomer may still be out of step: it keeps its right to repetitions for one more tick.
+        self._newcomer = self._newcomer and self.stalled
+        self.stalled = False
 
     def newcomer(self) -> None:
         """A new subscriber of the reading was matched."""

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 USAGE_ERROR = 2
 # A signal is noticed when spin_once returns.
 _SPIN_S = 0.1
-_DELIVER_S = 1.0
+# A message that was dropped on the way is sent again after a heartbeat, at most 3 s later.
+_DELIVER_S = 4.0
 
 
 def run_node(*names: str, executor: str = "events", argv: Sequence[str] | None = None) -> int:
@@ -84,7 +85,7 @@ def _run(names: Sequence[str], executor: str, arguments: list[str]) -> int:
 
 
 def _deliver(nodes: Sequence[Any]) -> None:
-    """Let the last messages reach those who are there, a recorder for one; a dead subscriber holds this up for 1 s."""
+    """Let the last messages reach those who are there, a recorder for one; a dead one holds this up for a while."""
     from rclpy.duration import Duration
 
     end = monotonic() + _DELIVER_S
