@@ -158,7 +158,7 @@ class Model:
         if content.get("schema") != SCHEMA:
             raise HannesError(f"{where}: schema is {content.get('schema')!r}; this version reads {SCHEMA!r}.")
         base = str(content.get("parameters", "hannes"))
-        base_path = path.parent / base if base.endswith((".yaml", ".yml")) else base
+        base_path = (path.parent / base).resolve() if base.endswith((".yaml", ".yml")) else base
         parameters = load_parameters(base_path)
         overrides = content.get("overrides") or {}
         if not isinstance(overrides, Mapping):
@@ -173,14 +173,20 @@ class Model:
             raise HannesError(f"{where}: 'variant' and 'provenance' must be mappings.")
         return cls(
             name=str(content.get("name", path.stem)),
-            plant=str(content.get("plant", "reduced")),
+            plant=_beside(str(content.get("plant", "reduced")), path.parent),
             parameters=ParameterSet(changed, parameters.source),
             base=str(base_path),
-            controller=str(content.get("controller", "double_pid")),
+            controller=_beside(str(content.get("controller", "double_pid")), path.parent),
             variant=variant,
             effects=_read_effects(content.get("effects") or [], where),
             provenance=provenance,
         )
+
+
+def _beside(name: str, folder: Path) -> str:
+    """`path.py:Class` with a path relative to the model file made absolute, where there is such a file."""
+    file, _, cls = name.rpartition(":")
+    return f"{(folder / file).resolve()}:{cls}" if file and (folder / file).is_file() else name
 
 
 def _read_effects(content: object, where: str) -> tuple[EffectEntry, ...]:

@@ -14,7 +14,7 @@ from hannes_description.model import Model
 from numpy.typing import NDArray
 
 from .depends import Dependence, residual_dependences
-from .errors import UNITS, SignalError, overall, signal_errors
+from .errors import SignalError, overall, signal_errors
 from .features import Block, Features, data_used
 from .fit import fit
 from .phases import METRICS, PHASES, metrics, phase_of
@@ -218,7 +218,7 @@ def _cells(
                     "condition": block.condition,
                     "signal": block.signal,
                     "phase": name,
-                    "unit": UNITS.get(block.signal, ""),
+                    "unit": block.unit,
                     "rmse": rmse,
                     "bias": float(residual[own].mean()),
                     "repeatability": repeat,
@@ -248,7 +248,7 @@ def _overlay(features: Features, block: Block, predicted: Array, label: NDArray[
     return Overlay(
         block.condition,
         block.signal,
-        UNITS.get(block.signal, ""),
+        block.unit,
         block.phase,
         mean,
         mean - spread,

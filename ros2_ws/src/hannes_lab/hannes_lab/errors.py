@@ -16,15 +16,6 @@ from .problem import Coordinate, Problem
 
 Array = NDArray[np.float64]
 
-UNITS = {
-    "encoder_position": "rad",
-    "motor_current": "A",
-    "motor_voltage": "V",
-    "grip_force": "N",
-    "motor_effort": "N.m",
-}
-
-
 @dataclass(frozen=True)
 class SignalError:
     """Error of one signal in one condition.
@@ -72,7 +63,7 @@ def signal_errors(
             SignalError(
                 block.condition,
                 block.signal,
-                UNITS.get(block.signal, ""),
+                block.unit,
                 rmse,
                 repeat,
                 rmse / repeat if repeat > 0 else float("nan"),

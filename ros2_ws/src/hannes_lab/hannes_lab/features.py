@@ -47,6 +47,7 @@ class Block:
     measured: Array
     full: tuple[Index, Index, Array]
     compact: tuple[Index, Index, Array] | None
+    unit: str = ""
 
     @property
     def n(self) -> int:
@@ -129,8 +130,8 @@ class Features:
         return np.concatenate([b.combine(c) for b, c in zip(self.blocks, closures, strict=True)])
 
 
-def build_features(trials: Sequence[Trial], signals: Sequence[str]) -> Features:
-    """The operator for these trials and signals.
+def build_features(trials: Sequence[Trial], signals: Sequence[str], points: int = MAX_PHASES) -> Features:
+    """The operator for these trials and signals, with at most `points` phases to a closure.
 
     Raises HannesError where no trial has any of the signals.
     """
@@ -142,7 +143,7 @@ def build_features(trials: Sequence[Trial], signals: Sequence[str]) -> Features:
         for condition in trial.conditions:
             for signal in signals:
                 if signal in trial.signals:
-                    block = _block(trial, number, condition, signal, end is not None)
+                    block = _block(trial, number, condition, signal, end is not None, points)
                     if block is not None:
                         blocks.append(block)
     if not blocks:
@@ -170,12 +171,14 @@ def _compact_end(trial: Trial) -> int | None:
     return min(trial.reference.size, round(second.stop / trial.period) + 60)
 
 
-def _block(trial: Trial, number: int, condition: str, signal: str, may_compact: bool) -> Block | None:
+def _block(
+    trial: Trial, number: int, condition: str, signal: str, may_compact: bool, most: int
+) -> Block | None:
     time, values = trial.signals[signal]
     closures = trial.of(condition)
     length = min(c.stop - c.start for c in closures)
     step = float(np.median(np.diff(time))) if time.size > 1 else length
-    points = int(min(MAX_PHASES, max(8, round(length / step))))
+    points = int(min(most, max(8, round(length / step))))
     phase = (np.arange(points) + 0.5) * (length - step) / points
     ticks = trial.reference.size
     sample_tick = np.clip(np.floor(time / trial.period + 1e-4).astype(np.int64), 0, ticks - 1)
@@ -213,7 +216,14 @@ def _block(trial: Trial, number: int, condition: str, signal: str, may_compact: 
         return np.array(a), np.array(b), np.array(w)
 
     return Block(
-        number, condition, signal, phase, np.array(measured), stack(full), stack(compact) if compact else None
+        number,
+        condition,
+        signal,
+        phase,
+        np.array(measured),
+        stack(full),
+        stack(compact) if compact else None,
+        trial.unit(signal),
     )
 
 

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hannes_control.double_pid import DoublePID
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.parameters import data_path, read_yaml
-from hannes_sim.effect import load_class
 from hannes_sim.factory import make_plant
 from hannes_sim.measurement import Sensors, folded_mean, logger, sample_noise
 from hannes_sim.objects import GraspObject, named_object
 from hannes_sim.plant import Plant
-from hannes_sim.rollout import Controller, Rollout, rollout
+from hannes_sim.rollout import Rollout
 from numpy.typing import NDArray
 
-from .rig import Nuisance
+from .rig import Nuisance, PlantRig, make_controller
 from .trials import Trial
+
+__all__ = ["HandRig", "make_controller", "object_of", "sensors_of"]
 
 Array = NDArray[np.float64]
 
@@ -62,25 +63,27 @@ def sensors_of(trial: Trial) -> dict[str, Any]:
     }
 
 
-class HandRig:
-    """Simulates trials of the hand, on whichever plant the model names.
+class HandRig(PlantRig):
+    """Simulates trials of the hand, on whichever plant the model names: objects, sensors and encoder zero per trial."""
 
-    Plants are built once per (model structure, trial) and then only re-parametrised.
-    """
+    population = data_path("parameters", "population.yaml")
+    figures = True
 
     def __init__(self, trials: Sequence[Trial]) -> None:
-        self.trials = tuple(trials)
-        self._plants: dict[tuple[str, ...], tuple[Plant, Controller, dict[str, float]]] = {}
+        super().__init__(trials)
         self._sensors = {trial.name: sensors_of(trial) for trial in self.trials}
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return HandRig, (self.trials,)
+    @classmethod
+    def read(cls, paths: Sequence[Path]) -> list[Trial]:
+        """Trials of all bags below the paths."""
+        from .prepare import load_trials
+
+        return load_trials(paths)
 
     def nuisances(self, model: Model) -> list[Nuisance]:
         """Priors from population.yaml; object parameters per trial with an object, the encoder's zero per trial."""
-        table = read_yaml(data_path("parameters", "population.yaml"), "population file")
         out = []
-        for name, entry in table.items():
+        for name, entry in read_yaml(Path(self.population), "population file").items():
             sd, scatter, relative = float(entry["hand_sd"]), float(entry["closure_sd"]), entry["unit"] == "1"
             if name in _PER_OBJECT:
                 for trial in self.trials:
@@ -92,33 +95,18 @@ class HandRig:
                 out += [
                     Nuisance(f"{name}@{trial.name}", 0.0, sd, False, scatter, "rad") for trial in self.trials
                 ]
-            else:
-                mean = model.parameters.value(name)
-                if mean > 0.0:
-                    out.append(Nuisance(name, mean, sd, relative, scatter, model.parameters[name].unit))
+            elif model.parameters.value(name) > 0.0:
+                out.append(self._nuisance(name, entry, model))
         return out
 
-    def _plant(self, model: Model, trial: Trial) -> tuple[Plant, Controller, dict[str, float]]:
-        structure = tuple(effect.source or effect.name for effect in model.effects)
-        key = (
-            model.plant,
-            model.controller,
-            model.parameters.sha256,
-            repr(sorted(model.variant.items())),
-            trial.name,
-            *structure,
-        )
-        if key not in self._plants:
-            plant = make_plant(model, object_of(trial))
-            plant.set("encoder.resolution", 0.0)
-            self._plants[key] = (plant, make_controller(model, trial.period), {})
-        return self._plants[key]
+    def plant(self, model: Model, trial: Trial) -> Plant:
+        """The plant with the trial's object, encoder quantiser off."""
+        plant = make_plant(model, object_of(trial))
+        plant.set("encoder.resolution", 0.0)
+        return plant
 
-    def simulate(
-        self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
-    ) -> dict[str, Array]:
-        """See Rig; the encoder's quantiser is off, so that the signals are smooth in the parameters."""
-        run = self.run(model, values, trial, reference)
+    def logged(self, run: Rollout, trial: Trial) -> dict[str, Array]:
+        """Signals as the hand's loggers show them: the current filtered, and rectified where it was."""
         logged = self._sensors[trial.name]
         current = logger(
             run.motor_current, trial.period, rectified=logged["rectified"], window=logged["window"]
@@ -132,33 +120,3 @@ class HandRig:
             "grip_force": run.grip_force,
             "motor_effort": run.motor_effort,
         }
-
-    def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
-        """The rollout itself, with all that the plant can show."""
-        plant, controller, base = self._plant(model, trial)
-        wanted = {f"{e.name}.{n}": p.value for e in model.effects for n, p in e.parameters.items()}
-        for name, value in values.items():
-            parameter, _, where = name.partition("@")
-            if not where or where == trial.name:
-                wanted[parameter] = value
-        for name in set(base) - set(wanted):
-            plant.set(name, base[name])
-        for name, value in wanted.items():
-            if name not in base:
-                base[name] = plant.get(name)
-            plant.set(name, value)
-        return rollout(plant, controller, reference, joints=False)
-
-
-def make_controller(model: Model, period: float) -> Controller:
-    """The control law that a model file names."""
-    if model.controller == "double_pid":
-        return DoublePID.of_model(model.parameters, period)
-    if ":" in model.controller:
-        file, _, name = model.controller.rpartition(":")
-        law: Controller = load_class(file, name, "controller")(model.parameters, period)
-        return law
-    raise HannesError(
-        f"Model '{model.name}': unknown controller '{model.controller}'; valid are double_pid, or "
-        "path.py:Class for your own."
-    )

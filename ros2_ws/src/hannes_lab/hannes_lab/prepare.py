@@ -16,7 +16,7 @@ from .features import Features, build_features
 from .fit import fit
 from .hand import HandRig
 from .problem import Problem, build_problem, nuisance_coordinate
-from .rig import Nuisance, Rig
+from .rig import Nuisance, PlantRig, Rig
 from .trials import SIGNALS, Closure, Trial, make_trial, unique_names
 
 OUTLIER = 6.0
@@ -99,17 +99,22 @@ def without_outliers(trial: Trial) -> Trial:
 
 
 def prepare(
-    trials: Sequence[Trial], model: Model, *, rig: Rig | None = None, signals: Sequence[str] | None = None
+    trials: Sequence[Trial],
+    model: Model,
+    *,
+    rig: Rig | type[PlantRig] | None = None,
+    signals: Sequence[str] | None = None,
 ) -> Prepared:
     """Estimate noise and scatter at the fitted nominal model.
 
-    rig      another machine's rig; the hand's if None
+    rig      another machine's rig, or its class; the hand's if None
     signals  which signals take part; all that are there if None
     """
     trials = [without_outliers(trial) for trial in trials]
-    rig = rig or HandRig(trials)
-    present = [s for s in (signals or (*SIGNALS, "motor_effort")) if any(s in t.signals for t in trials)]
-    features = build_features(trials, present)
+    rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
+    known = dict.fromkeys((*SIGNALS, "motor_effort", *(s for t in trials for s in t.signals)))
+    present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
+    features = build_features(trials, present, rig.points)
     nuisances = tuple(rig.nuisances(model))
     problem = build_problem(rig, features, model, nuisances, {})
     coordinates = [nuisance_coordinate(n) for n in nuisances]
@@ -122,7 +127,7 @@ def prepare(
         notes.append(
             "there is one condition only: what fits it may fail elsewhere; record another speed and a grasp"
         )
-    if "motor_current" not in present and "motor_effort" not in present:
+    if not any(signal in present for signal in rig.drive_signals):
         notes.append("no current is recorded: friction, torque constant and inertia are hard to tell apart")
     if "encoder_position" not in present:
         notes.append(

@@ -26,10 +26,6 @@ from .rig import Nuisance, Rig
 
 Array = NDArray[np.float64]
 
-FLOOR = 2e-4
-"""Smallest standard deviation of a sample, relative to the span of its signal: what replay of a logged reference and a
-plant of finite step can promise."""
-
 FAILED = 1e3
 """Whitened residual of a simulation that diverged: a large finite penalty."""
 
@@ -166,7 +162,7 @@ def build_problem(
     variances = []
     for block, e in zip(features.blocks, deviations, strict=True):
         span = float(np.ptp(block.measured)) or 1.0
-        floor = (FLOOR * span) ** 2
+        floor = (rig.floor * span) ** 2
         variances.append(_sample_variance(block.measured, e) + floor)
     columns: list[list[Array]] = []
     scatter_names = [n for n in nuisances if n.closure_sd > 0.0]

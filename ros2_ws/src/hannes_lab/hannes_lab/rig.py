@@ -1,20 +1,37 @@
-"""What the lab must know of a machine: its uncertain nominal parameters and how to simulate a trial."""
+"""What the lab must know of a machine: what was recorded, its uncertain parameters, and how to simulate a trial.
+
+`Rig` is all that the lab calls.  `PlantRig` does most of it for a machine with one drive and a control law in the
+loop; an adapter derives from it and gives a reader, a model, tolerances and the sizes of the machine.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
+from hannes_control.double_pid import DoublePID
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.parameters import read_yaml
+from hannes_sim.effect import EffectType, load_class
+from hannes_sim.factory import make_plant
+from hannes_sim.plant import Plant
+from hannes_sim.rollout import Controller, Rollout, rollout
 from numpy.typing import NDArray
 
 from .trials import Trial
 
 Array = NDArray[np.float64]
+
+REFERENCE_SIZES = {"N.m": 0.05, "rad": 14.57, "V": 12.0, "A": 1.0, "s": 1.0}
+"""What the catalogue's typical values and bounds are made for: a drive that needs 0.05 N.m to move freely over
+14.57 rad at up to 12 V and about 1 A.  Another machine's follow from these by dimension."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +67,24 @@ class Rig(Protocol):
     """A machine: plant and controller behind one call.
 
     trials    what was recorded
-    signals   per trial, which signals are compared
+    floor     smallest standard deviation of a sample, relative to the span of its signal, that the simulation of a
+              logged reference can promise
+    points    points of the phase grid of one closure at most
+    without   effects that have no meaning on this machine, with the reason
+    drive_signals  signals that tell force or torque of the drive
     """
 
     trials: tuple[Trial, ...]
+    floor: float
+    points: int
+    drive_signals: tuple[str, ...]
+    without: Mapping[str, str]
 
     def nuisances(self, model: Model) -> Sequence[Nuisance]:
         """The uncertain nominal parameters with their priors."""
+
+    def effect(self, kind: EffectType) -> EffectType:
+        """An effect of the catalogue with typical values, bounds and units for this machine."""
 
     def simulate(
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
@@ -66,3 +94,209 @@ class Rig(Protocol):
         `values` overrides parameters of the model by name (nominal ones, and effect.parameter).
         Raises PlantDiverged.
         """
+
+
+class PlantRig:
+    """A machine with one drive, simulated by the plant and the control law of a model file.
+
+    An adapter gives:
+
+    model        the nominal model: a shipped name or a path
+    population   path of the tolerances: parameter -> {sd, closure_sd, unit, source}; unit "1" is relative (logarithmic)
+    read         recordings into trials
+    logged       what the loggers show of a rollout (default: position, current, voltage)
+    sizes        force or torque ("N.m") that moves the machine freely, travel ("rad"), and whatever else differs
+                 from REFERENCE_SIZES; effects are scaled by them
+    linear       True where position is in m and the drive gives N: units are named so
+    without      effects that have no meaning here, with the reason
+    floor, points, drive_signals  see Rig
+    phases       other names for the phases void, grasp, hold, opening, rest
+    figures      True where the figures of a hand's closure (closing time, grip force ...) have a meaning
+
+    Plants are built once per (model structure, trial) and then only re-parametrised.
+    """
+
+    model: ClassVar[str | Path] = "nominal"
+    population: ClassVar[str | Path] = ""
+    sizes: ClassVar[Mapping[str, float]] = {}
+    linear: ClassVar[bool] = False
+    without: Mapping[str, str] = {}
+    floor: float = 2e-4  # replay of a reference logged by messages, and a plant of finite step
+    points: int = 160
+    drive_signals: tuple[str, ...] = ("motor_current", "motor_effort")
+    phases: ClassVar[Mapping[str, str]] = {}
+    figures: ClassVar[bool] = False
+    source: ClassVar[str] = ""
+
+    def __init__(self, trials: Sequence[Trial]) -> None:
+        self.trials = tuple(trials)
+        self._plants: dict[tuple[str, ...], tuple[Plant, Controller, dict[str, float]]] = {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A class from a user's file cannot be imported by name in another process.
+        return (_rebuild, (self.source or type(self), self.trials))
+
+    @classmethod
+    def read(cls, paths: Sequence[Path]) -> list[Trial]:
+        """Trials of the given files; raises HannesError that names the file."""
+        raise HannesError(f"The rig '{cls.__name__}' has no reader: define `read(cls, paths)`.")
+
+    def nuisances(self, model: Model) -> list[Nuisance]:
+        """Priors from the file of tolerances, around the model's values."""
+        table = read_yaml(Path(self.population), "file of tolerances")
+        return [self._nuisance(name, entry, model) for name, entry in table.items()]
+
+    def _nuisance(self, name: str, entry: Mapping[str, Any], model: Model) -> Nuisance:
+        try:
+            sd, scatter = float(entry.get("sd", entry.get("hand_sd"))), float(entry["closure_sd"])
+            relative = str(entry["unit"]) == "1"
+        except (KeyError, TypeError, ValueError) as error:
+            raise HannesError(
+                f"{self.population}: '{name}' needs the numbers sd and closure_sd, and a unit ({error})."
+            ) from error
+        unit = model.parameters[name].unit
+        return Nuisance(name, model.parameters.value(name), sd, relative, scatter, unit)
+
+    def effect(self, kind: EffectType) -> EffectType:
+        """See Rig."""
+        return scaled_effect(kind, tuple(sorted(self.sizes.items())), self.linear)
+
+    def controller(self, model: Model, period: float) -> Controller:
+        """The control law in the loop."""
+        return make_controller(model, period)
+
+    def plant(self, model: Model, trial: Trial) -> Plant:
+        """The plant for one trial, encoder quantiser off: a fit needs signals that are smooth in the parameters."""
+        plant = make_plant(model)
+        if "encoder.resolution" in plant.names:
+            plant.set("encoder.resolution", 0.0)
+        return plant
+
+    def logged(self, run: Rollout, trial: Trial) -> dict[str, Array]:
+        """Signals by name on the control grid."""
+        return {
+            "encoder_position": run.encoder_position,
+            "motor_current": run.motor_current,
+            "motor_voltage": run.motor_voltage,
+        }
+
+    def simulate(
+        self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
+    ) -> dict[str, Array]:
+        """See Rig."""
+        return self.logged(self.run(model, values, trial, reference), trial)
+
+    def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
+        """The rollout itself, with all that the plant can show."""
+        plant, controller, base = self._plant(model, trial)
+        wanted = {f"{e.name}.{n}": p.value for e in model.effects for n, p in e.parameters.items()}
+        for name, value in values.items():
+            parameter, _, where = name.partition("@")
+            if not where or where == trial.name:
+                wanted[parameter] = value
+        for name in set(base) - set(wanted):
+            plant.set(name, base[name])
+        for name, value in wanted.items():
+            if name not in base:
+                base[name] = plant.get(name)
+            plant.set(name, value)
+        return rollout(plant, controller, reference, joints=False)
+
+    def _plant(self, model: Model, trial: Trial) -> tuple[Plant, Controller, dict[str, float]]:
+        structure = tuple(effect.source or effect.name for effect in model.effects)
+        key = (
+            model.plant,
+            model.controller,
+            model.parameters.sha256,
+            repr(sorted(model.variant.items())),
+            trial.name,
+            *structure,
+        )
+        if key not in self._plants:
+            self._plants[key] = (self.plant(model, trial), self.controller(model, trial.period), {})
+        return self._plants[key]
+
+
+def make_controller(model: Model, period: float) -> Controller:
+    """The control law that a model file names."""
+    if model.controller == "double_pid":
+        return DoublePID.of_model(model.parameters, period)
+    if ":" in model.controller:
+        file, _, name = model.controller.rpartition(":")
+        law: Controller = load_class(file, name, "controller")(model.parameters, period)
+        return law
+    raise HannesError(
+        f"Model '{model.name}': unknown controller '{model.controller}'; valid are double_pid, or "
+        "path.py:Class for your own."
+    )
+
+
+def load_rig(source: str) -> type[PlantRig]:
+    """The rig class of an adapter, given as path.py:Class."""
+    file, _, name = source.rpartition(":")
+    if not file:
+        raise HannesError(f"--rig {source}: give path.py:Class, the adapter of your machine.")
+    found = load_class(file, name, "rig")
+    if not (isinstance(found, type) and issubclass(found, PlantRig)):
+        raise HannesError(f"'{name}' in '{file}' is not a subclass of hannes_lab.rig.PlantRig.")
+    found.source = f"{Path(file).expanduser().resolve()}:{name}"
+    return found
+
+
+def _rebuild(rig: str | type[PlantRig], trials: tuple[Trial, ...]) -> PlantRig:
+    return (load_rig(rig) if isinstance(rig, str) else rig)(trials)
+
+
+# -- effects of the catalogue on a machine of another size ----------------------------------------------------------
+def _tokens(unit: str) -> list[tuple[str, float]]:
+    """Base units of a unit such as N.m.s/rad or rad/(N.m), with exponents."""
+    out: list[tuple[str, float]] = []
+    marked = unit.replace("kg.m2", "J").replace("N.m", "T")
+    for part, sign in zip(marked.split("/"), (1.0, *[-1.0] * marked.count("/")), strict=True):
+        for token in part.strip("()").split("."):
+            match = re.fullmatch(r"([A-Za-z]+)(\d*)", token)
+            if match:
+                power = sign * float(match.group(2) or 1)
+                name = {"T": "N.m", "J": "kg.m2"}.get(match.group(1), match.group(1))
+                out.append((name, power))
+    return out
+
+
+def unit_factor(unit: str, sizes: Mapping[str, float]) -> float:
+    """How much larger a quantity of this unit is on a machine of the given sizes than on the reference machine."""
+    ratio = {token: sizes.get(token, size) / size for token, size in REFERENCE_SIZES.items()}
+    ratio["kg.m2"] = ratio["N.m"] * ratio["s"] ** 2 / ratio["rad"]
+    ratio["ohm"] = ratio["V"] / ratio["A"]
+    return math.prod(ratio.get(token, 1.0) ** power for token, power in _tokens(unit))
+
+
+def linear_unit(unit: str) -> str:
+    """The unit of the same quantity where the drive is linear: N for N.m, m for rad."""
+    for a, b in (("kg.m2", "kg"), ("(N.m)", "N"), ("N.m", "N"), ("rad", "m")):
+        unit = unit.replace(a, b)
+    return unit
+
+
+@lru_cache(maxsize=512)
+def scaled_effect(kind: EffectType, sizes: tuple[tuple[str, float], ...], linear: bool) -> EffectType:
+    """The effect with bounds, typical values and starts scaled by dimension to a machine of other sizes."""
+    if not sizes and not linear:
+        return kind
+    parameters = []
+    for p in kind.parameters:
+        f = unit_factor(p.unit, dict(sizes))
+        parameters.append(
+            replace(
+                p,
+                unit=linear_unit(p.unit) if linear else p.unit,
+                lower=p.lower * f,
+                upper=p.upper * f,
+                typical=p.typical * f,
+                vanishing=None if p.vanishing is None else p.vanishing * f,
+                starts=tuple(min(max(v * f, p.lower * f), p.upper * f) for v in p.starts),
+            )
+        )
+    made: EffectType = type(
+        kind.__name__, (kind,), {"parameters": tuple(parameters), "__doc__": kind.__doc__}
+    )
+    return made

@@ -6,6 +6,7 @@ comes back; another machine's adapter may give its own stretches.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,6 +21,15 @@ Array = NDArray[np.float64]
 
 SIGNALS = ("encoder_position", "motor_current", "motor_voltage", "grip_force")
 """Signals that are compared, in this order, as far as a recording has them."""
+
+UNITS = {
+    "encoder_position": "rad",
+    "motor_current": "A",
+    "motor_voltage": "V",
+    "grip_force": "N",
+    "motor_effort": "N.m",
+}
+"""Units of the signals; a trial may name others."""
 
 ZERO_ORDER_HOLD_RATE = 90.0
 """Hz; a reference logged at least this fast is what the controller received, message by message; a slower log has
@@ -42,6 +52,7 @@ class Trial:
     reference  (n,) on the control grid: reference[k] acts from k x period on
     signals    name -> (time (m,) s, values (m,))
     options    what the plant must know of this recording (object, sensors, pose); the rig's adapter reads it
+    units      units of signals whose unit is not that of UNITS
     """
 
     name: str
@@ -53,6 +64,7 @@ class Trial:
     source: str = ""
     sha256: str = ""
     notes: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.reference.ndim != 1 or self.reference.size < 2:
@@ -62,6 +74,9 @@ class Trial:
                 f"Trial '{self.name}': no closure was found: the reference never leaves its rest value "
                 "and comes back. Record at least one whole closure."
             )
+
+    def unit(self, signal: str) -> str:
+        return self.units.get(signal, UNITS.get(signal, ""))
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -158,6 +173,18 @@ def find_closures(reference: Array, period: float, *, lead: float = 0.03) -> lis
         end = starts[k + 1][0] - lead if k + 1 < len(starts) else (reference.size - 1) * period
         out.append((begin, min(end, last + (last - first))))
     return out
+
+
+def find_moves(reference: Array, period: float, *, slow: float = 0.1) -> list[tuple[float, float]]:
+    """Start and stop [s] of every stretch between two moments at which the reference (nearly) stands.
+
+    Such a moment is the slowest sample of a run whose speed is below `slow` times the greatest speed.  For machines
+    that move on from place to place instead of coming back to rest; stretches cut off at the ends are left out.
+    """
+    speed = np.abs(np.gradient(reference, period))
+    stands = speed < slow * float(speed.max())
+    turns = [first + int(np.argmin(speed[first : last + 1])) for first, last in _runs(stands)]
+    return [(a * period, b * period) for a, b in itertools.pairwise(turns) if b - a >= 3]
 
 
 def group_closures(
