@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+from collections.abc import Mapping
 
 import numpy as np
 from graph import NodeProcess, Peer, processes
@@ -150,6 +151,10 @@ def test_real_time_goes_to_zero_volt_when_the_state_stops(peer):
         assert voltages(peer)[-1] == 0.0
 
 
+def without_command(status: Mapping[str, str]) -> bool:
+    return status["message"].startswith("command timed out: 0 V")
+
+
 def test_killed_or_stopped_controller_leaves_zero_volt(peer):
     peer.hear_diagnostics()
     sim = NodeProcess("hand_sim", clock="realtime", command_timeout_ms=60)
@@ -160,7 +165,7 @@ def test_killed_or_stopped_controller_leaves_zero_volt(peer):
         running = peer.until_status("hand_sim", lambda s: s["message"].startswith("running"), "a driven motor")
         before = int(running["command_timeouts"])
         first.send(signal.SIGSTOP)
-        stopped = peer.until_status("hand_sim", lambda s: s["message"].startswith("command timed out: 0 V"), "the timeout")
+        stopped = peer.until_status("hand_sim", without_command, "the timeout")
         assert stopped["applied_voltage"] == "0"
         assert int(stopped["command_timeouts"]) > before
         assert float(stopped["command_age_at_zero_s"]) <= 0.1
@@ -171,10 +176,10 @@ def test_killed_or_stopped_controller_leaves_zero_volt(peer):
         assert paused["active"] == "False"
         assert "activate again" in paused["message"]
         peer.spin(0.3)
-        assert peer.status("hand_sim")["message"].startswith("command timed out: 0 V")
+        assert without_command(peer.status("hand_sim"))
         assert transition(peer, Transition.TRANSITION_ACTIVATE)
         peer.until_status("hand_sim", lambda s: s["message"].startswith("running"), "driven again")
         first.send(signal.SIGKILL)
-        killed = peer.until_status("hand_sim", lambda s: s["message"].startswith("command timed out: 0 V"), "the timeout")
+        killed = peer.until_status("hand_sim", without_command, "the timeout")
         assert killed["applied_voltage"] == "0"
         assert float(killed["command_age_at_zero_s"]) <= 0.1
