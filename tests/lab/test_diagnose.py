@@ -8,10 +8,10 @@ from hannes_description.model import Model
 from hannes_lab.add import add_effects
 from hannes_lab.compare import compare
 from hannes_lab.diagnose import Diagnosis, diagnose, effect_sources
-from hannes_lab.hide import Truth, make_set, strength_of
+from hannes_lab.hide import Truth, make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.trials import make_trial
-from hannes_sim.effect import load_effect
+from hannes_sim.effect import load_effect, strength_of
 
 CLOSURES = 8
 

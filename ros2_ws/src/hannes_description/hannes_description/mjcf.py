@@ -57,7 +57,10 @@ GRASP_CENTRE = (0.062, 0.0, 0.097)
 """m, palm frame: middle of the space that fingers and thumb close on."""
 
 BAR_HALF_LENGTH = 0.045
-"""m; half the length of a capsule or box across the fingers."""
+"""m; half the length of a capsule, box or prism across the fingers."""
+
+PRISM_SIDES: Mapping[str, int] = {"prism": 6, "pentagon": 5}
+"""Sides of the regular prisms by shape."""
 
 
 class GraspShape(Protocol):
@@ -383,7 +386,8 @@ def _add_drive(spec: mujoco.MjSpec, parameters: Parameters) -> None:
 def _add_object(spec: mujoco.MjSpec, grasp: GraspShape, tree: tuple[Link, ...]) -> None:
     """The object on a fixed body, one explicit contact pair with every phalanx, and a sensor of the normal forces."""
     kinds = {"capsule": mujoco.mjtGeom.mjGEOM_CAPSULE, "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-             "box": mujoco.mjtGeom.mjGEOM_BOX}
+             "box": mujoco.mjtGeom.mjGEOM_BOX, "prism": mujoco.mjtGeom.mjGEOM_MESH,
+             "pentagon": mujoco.mjtGeom.mjGEOM_MESH}
     if grasp.shape not in kinds:
         raise HannesError(f"Object shape {grasp.shape!r} is unknown; valid are {', '.join(kinds)}.")
     place = [a + b for a, b in zip(GRASP_CENTRE, grasp.place, strict=True)]
@@ -395,6 +399,9 @@ def _add_object(spec: mujoco.MjSpec, grasp: GraspShape, tree: tuple[Link, ...]) 
         shape = {"size": [half, BAR_HALF_LENGTH, 0.0], "quat": across}
     elif grasp.shape == "box":
         shape = {"size": [half, BAR_HALF_LENGTH, half]}
+    elif grasp.shape in PRISM_SIDES:
+        spec.add_mesh(name="object", uservert=_prism(PRISM_SIDES[grasp.shape], half))
+        shape = {"meshname": "object"}
     body.add_geom(name="object", type=kinds[grasp.shape], contype=0, conaffinity=0, material="object", group=0, **shape)
     body.add_site(name="object", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1.0, 0.0, 0.0], group=5)
     spec.add_sensor(name="grip_force", type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE,
@@ -404,6 +411,13 @@ def _add_object(spec: mujoco.MjSpec, grasp: GraspShape, tree: tuple[Link, ...]) 
             spec.add_pair(name=f"object_{link.name}", geomname1="object", geomname2=link.name,
                           condim=3 if grasp.friction > 0.0 else 1, solimp=_flat(CONTACT_IMPEDANCE),
                           friction=[max(grasp.friction, 1e-5)] * 2 + [0.0, 0.0, 0.0])
+
+
+def _prism(sides: int, radius: float) -> list[float]:
+    """Corners (flat x, y, z) of a regular prism along y, one edge towards the fingertips' side (distal)."""
+    angles = 2.0 * math.pi * np.arange(sides) / sides
+    return [c for y in (-BAR_HALF_LENGTH, BAR_HALF_LENGTH) for a in angles
+            for c in (radius * math.sin(a), y, radius * math.cos(a))]
 
 
 def _map_stiffness(spec: mujoco.MjSpec, parameters: Parameters, variant: Variant, grasp: GraspShape | None) -> None:

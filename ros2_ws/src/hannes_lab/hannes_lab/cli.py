@@ -344,7 +344,9 @@ def hide(
     json: Json = False,
 ) -> None:
     """Make a measurement set with a hidden effect, to test the lab or to learn what an effect looks like."""
-    from .hide import DEFAULT_CONDITIONS, make_set, strength_of, write_set
+    from hannes_sim.effect import strength_of
+
+    from .hide import DEFAULT_CONDITIONS, make_set, write_set
 
     entries = []
     for text in effects or ():

@@ -21,7 +21,6 @@ from hannes_description.errors import HannesError
 from hannes_description.model import EffectEntry, Model
 from hannes_description.parameters import data_path, read_yaml
 from hannes_description.signals import SIGNALS
-from hannes_sim.effect import effect_source, load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.measurement import SENSORS, Sensors
 from hannes_sim.objects import named_object
@@ -66,16 +65,6 @@ DEFAULT_CONDITIONS = ("slow", "fast", "grasp")
 
 REST = 0.5
 """s of rest before the first closure."""
-
-
-def strength_of(effect: str, factor: float) -> EffectEntry:
-    """An effect at `factor` times its typical strength; shape parameters stay typical."""
-    kind = load_effect(effect)
-    values = {}
-    for p in kind.parameters:
-        scale = factor if p.vanishing is not None else 1.0
-        values[p.name] = min(max(p.typical * scale, p.lower), p.upper)
-    return kind.entry(values, source=effect_source(kind, effect))
 
 
 @dataclass(frozen=True)

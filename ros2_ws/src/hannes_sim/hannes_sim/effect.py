@@ -310,4 +310,14 @@ def effect_source(effect: EffectType, given: str) -> str | None:
     return f"{Path(file).expanduser().resolve()}:{class_name}"
 
 
+def strength_of(effect: str, factor: float) -> EffectEntry:
+    """An effect at `factor` times its typical strength; shape parameters stay typical."""
+    kind = load_effect(effect)
+    values = {}
+    for p in kind.parameters:
+        scale = factor if p.vanishing is not None else 1.0
+        values[p.name] = min(max(p.typical * scale, p.lower), p.upper)
+    return kind.entry(values, source=effect_source(kind, effect))
+
+
 EffectFunction = Callable[[Any, Any, Any, Any], None]

@@ -34,6 +34,7 @@ from hannes_description.mjcf import (
     DRIVE,
     MASTER,
     MOTOR,
+    PRISM_SIDES,
     WIRE_IMPEDANCE,
     Variant,
     build_spec,
@@ -365,6 +366,8 @@ class MujocoPlant:
         self.parameters[_OBJECT_B] = damping
         for k in range(m.npair):
             m.pair_solref[k, 0] = -stiffness * self._table[_T_PAIRS + k]
+        if self.grasp.shape in PRISM_SIDES:
+            return  # a mesh keeps the size that it was compiled with
         geom = m.geom("object").id
         half = 0.5 * self.grasp.size
         m.geom_size[geom, 0] = half
@@ -399,6 +402,7 @@ class MujocoPlant:
             elif name in _OBJECT_NAMES and self.grasp is not None:
                 if name == "object.position":
                     self.grasp = replace(self.grasp, size=self._opening() - value * self.parameters[_TIP])
+                    rebuild = rebuild or self.grasp.shape in PRISM_SIDES
                 elif name == "object.stiffness":
                     self.grasp = replace(self.grasp, stiffness=value)
                 else:

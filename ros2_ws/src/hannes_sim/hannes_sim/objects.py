@@ -10,15 +10,17 @@ from typing import Any
 
 from hannes_description.errors import HannesError
 
-SHAPES = ("capsule", "sphere", "box")
+SHAPES = ("capsule", "sphere", "box", "prism", "pentagon")
+"""prism and pentagon are regular prisms of six and five sides; all but the sphere lie across the fingers."""
 
 
 @dataclass(frozen=True)
 class GraspObject:
     """An object held fixed in the palm's frame, as on a dynamometer.
 
-    shape      capsule (a bar across the fingers), sphere or box
-    size       m, what lies between fingertips and thumb when they touch it (diameter, thickness)
+    shape      capsule (a bar across the fingers), sphere, box, prism (six sides) or pentagon (five sides)
+    size       m, what lies between fingertips and thumb when they touch it (diameter, thickness; of a prism the
+               diameter of the circle through its edges)
     stiffness  N/m of the whole grasp, object and fingertip pads together; each of the five digits' contacts has a fifth
     damping    N.s/m
     friction   Coulomb coefficient
