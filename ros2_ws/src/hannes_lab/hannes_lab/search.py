@@ -23,6 +23,7 @@ from .problem import (
     vanishing_entry,
 )
 from .rig import Nuisance
+from .spectrum import position_periods
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -81,7 +82,7 @@ class Search:
 
     # -- pieces -------------------------------------------------------------------------------------------------
     def effect(self, name: str) -> EffectType:
-        return load_effect(self.sources[name])
+        return self.problem.rig.effect(load_effect(self.sources[name]))
 
     def null(self) -> Candidate:
         """The model as it is, with its nuisance parameters fitted."""
@@ -113,7 +114,8 @@ class Search:
         for p in self.effect(name).parameters:
             c = own[f"{name}.{p.name}"]
             if p.vanishing is None:
-                shapes.append([(c.name, c.z(v)) for v in (p.starts or (p.typical,))])
+                found = position_periods(self.problem, base, p.lower, p.upper) if p.period else ()
+                shapes.append([(c.name, c.z(v)) for v in (*(p.starts or (p.typical,)), *found)])
             else:
                 low, high = c.bounds
                 points = [c.z(v) for v in p.starts] or [z for s in STRENGTHS for z in (s, -s)]

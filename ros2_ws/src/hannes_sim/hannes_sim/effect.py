@@ -40,6 +40,8 @@ class EffectParameter:
     starts         values from which a search starts, where the error has several minima; without them a strength is
                    searched at multiples of its typical value
     description    what it is
+    period         True for a period in the motor's position: a search also starts from the lines in the spectrum of
+                   the residual over the position
     """
 
     name: str
@@ -50,6 +52,7 @@ class EffectParameter:
     vanishing: float | None = None
     description: str = ""
     starts: tuple[float, ...] = ()
+    period: bool = False
 
     def __post_init__(self) -> None:
         if not self.lower <= self.typical <= self.upper:

@@ -28,6 +28,7 @@ class Cogging(Effect):
             None,
             "period P at the pulley",
             starts=(0.3306939635357677, 1.65, 3.14159265, 6.283185307179586, 23.876),
+            period=True,
         ),
     )
     looks_like = "the current wobbles with the angle, at the same angles in every closure and at every speed"

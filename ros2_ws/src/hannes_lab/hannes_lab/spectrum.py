@@ -1,0 +1,94 @@
+"""Periods in the position at which a residual repeats: where the search for ripple starts.
+
+The residual of a ripple is a line in its spectrum over position.  Least-squares periodogram (Lomb 1976, Scargle 1982)
+of the mean residual of every condition and signal, added up; a line counts where it stands out of its surroundings.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import gamma
+
+from .fit import Fit
+from .problem import Problem
+
+Array = NDArray[np.float64]
+
+CHANCE = 1e-3
+"""Chance that a line stands out in a residual without one."""
+
+COLOUR = 1.5
+"""Factor on what white noise reaches: residuals are smooth, so that their spectra are uneven."""
+
+SURROUNDINGS = 300
+"""Frequencies on each side of a line with which it is compared."""
+
+
+def position_periods(problem: Problem, fit: Fit, lower: float, upper: float, keep: int = 2) -> tuple[float, ...]:
+    """Up to `keep` periods between lower and upper [unit of the position] that stand out, strongest first.
+
+    Empty where no position is recorded or nothing stands out.
+    """
+    features = problem.features
+    predicted = features.closures(problem.rig, fit.model, fit.values)
+    places = {b.condition: b for b in features.blocks if b.signal == "encoder_position"}
+    curves: list[tuple[Array, Array]] = []
+    spans: dict[str, float] = {}
+    for block, model in zip(features.blocks, predicted, strict=True):
+        if block.condition in places:
+            place = places[block.condition]
+            x = np.interp(block.phase, place.phase, place.measured.mean(axis=0))
+            curves.append((x, (block.measured - model).mean(axis=0)))
+            spans[block.condition] = float(np.ptp(x))
+    if not curves:
+        return ()
+    total = max(float(x.max()) for x, _ in curves) - min(float(x.min()) for x, _ in curves)
+    steps = [float(np.quantile(np.abs(np.diff(x)), 0.9)) for x, _ in curves]
+    if total <= 0.0 or min(steps) <= 0.0:
+        return ()
+    lower = max(lower, 2.2 * min(steps))
+    upper = min(upper, total)
+    if lower >= upper:
+        return ()
+    frequency = np.arange(1.0 / upper, 1.0 / lower, 0.2 / total)
+    power = np.zeros(frequency.size)
+    for (x, r), step in zip(curves, steps, strict=True):
+        # Long moves resolve a line, short ones smear it.
+        power += float(np.ptp(x)) * _periodogram(x, r, frequency) * (frequency < 1.0 / (2.2 * step))
+    # Sum of n exponentials (the powers of white noise in n conditions); signals of one condition tell the same.
+    n = sum(spans.values()) ** 2 / sum(s * s for s in spans.values())
+    stands_out = COLOUR * float(gamma.isf(CHANCE / frequency.size, n) / gamma.median(n))
+    ratio = np.array(
+        [
+            power[k] / max(float(np.median(power[max(0, k - SURROUNDINGS) : k + SURROUNDINGS + 1])), 1e-300)
+            for k in range(power.size)
+        ]
+    )
+    out: list[float] = []
+    for k in np.argsort(-ratio):
+        if ratio[k] < stands_out or len(out) == keep:
+            break
+        if all(abs(frequency[k] - 1.0 / period) > 3.0 / total for period in out):
+            out.append(float(1.0 / frequency[k]))
+    return tuple(out)
+
+
+def _periodogram(x: Array, r: Array, frequency: Array) -> Array:
+    """Part of the residual's variance (m,) that a sine and a cosine of each frequency explain, after a cubic in x."""
+    u = (x - x.mean()) / (float(np.ptp(x)) or 1.0)
+    trend = np.polynomial.polynomial.polyvander(u, 3)
+    basis, _ = np.linalg.qr(trend)
+    rest = r - basis @ (basis.T @ r)
+    energy = float(rest @ rest)
+    if energy <= 0.0:
+        return np.zeros(frequency.size)
+    angle = 2.0 * np.pi * np.outer(frequency, x)
+    c, s = np.cos(angle), np.sin(angle)
+    c -= (c @ basis) @ basis.T
+    s -= (s @ basis) @ basis.T
+    cc, ss, cs = (c * c).sum(axis=1), (s * s).sum(axis=1), (c * s).sum(axis=1)
+    cr, sr = c @ rest, s @ rest
+    determinant = np.maximum(cc * ss - cs * cs, 1e-9 * cc * ss + 1e-300)
+    out: Array = (ss * cr * cr - 2.0 * cs * cr * sr + cc * sr * sr) / determinant / energy
+    return out
