@@ -1,0 +1,1 @@
+"""The plant held against the thesis, row by row (R01 to R16): `hannes validate`."""
