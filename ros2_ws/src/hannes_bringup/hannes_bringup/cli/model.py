@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -71,3 +72,46 @@ def show(
         print_table(title, columns, rows, right=(1, 3, 4))
     if not loaded.effects:
         typer.echo("\nNo effects beyond the nominal model.")
+
+
+@app.command()
+def effects(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(help="Effects by name, or your own as path.py:Class; none: the catalogue."),
+    ] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="Write a page (.md) with a picture of each effect's signature.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """List the effects that a model can be given: parameters, bounds, what each looks like in the data."""
+    from hannes_lab.effects_page import describe, write_page
+    from hannes_sim.effect import catalogue, load_effect
+
+    wanted = names or list(catalogue())
+    found = [describe(load_effect(name)) for name in wanted]
+    if page:
+        typer.echo(f"{write_page(page, wanted)}: {len(wanted)} effects")
+    elif json:
+        print_json({"effects": found})
+    else:
+        rows = [
+            (
+                effect["name"] if k == 0 else "",
+                p["name"],
+                p["unit"],
+                number(p["lower"]),
+                number(p["upper"]),
+                number(p["typical"]),
+                number(p["vanishing"]),
+                p["description"],
+            )
+            for effect in found
+            for k, p in enumerate(effect["parameters"])
+        ]
+        columns = ("effect", "parameter", "unit", "lower", "upper", "typical", "off at", "what it is")
+        print_table("Effects", columns, rows, right=(3, 4, 5, 6))
+        typer.echo(
+            "\nWith pictures: docs/effects.md, written by `hannes model effects --page docs/effects.md`."
+        )
