@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,15 +16,18 @@ from .depends import Dependence, residual_dependences
 from .errors import (
     SignalError,
     held_out_closures,
-    held_out_conditions,
+    held_out_condition_errors,
     overall,
+    per_signal,
     signal_errors,
 )
 from .experiments import Experiment, separating_experiments
 from .features import Features, data_used
 from .fit import Fit
+from .greedy import grow
 from .prepare import Prepared
 from .problem import Problem, build_problem
+from .screen import usable_effects
 from .search import Candidate, Progress, Search, silent
 
 Array = NDArray[np.float64]
@@ -82,13 +85,15 @@ class FoundEffect:
 @dataclass(frozen=True)
 class Fall:
     """One step of the error's fall, in multiples of the repeatability: fitted on every second closure, judged on the
-    others; by_condition: error on each condition when it took no part in the fit."""
+    others; by_condition: error on each condition when it took no part in the fit; held_out_signals: the same per signal, root
+    mean square over the conditions in the signal's unit."""
 
     added: str
     train: float
     held_out: float
     by_condition: Mapping[str, float]
     signals: tuple[SignalError, ...]
+    held_out_signals: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -97,6 +102,7 @@ class Fall:
             "held_out": self.held_out,
             "by_condition": dict(self.by_condition),
             "signals": [s.to_dict() for s in self.signals],
+            "held_out_signals": dict(self.held_out_signals),
         }
 
 
@@ -178,14 +184,23 @@ def diagnose(
     jobs: int = 1,
     progress: Progress = silent,
     max_effects: int = MAX_EFFECTS,
+    greedy: bool = False,
 ) -> Diagnosis:
-    """Search the catalogue; see the module docstrings of search, chance and problem for the method."""
+    """Search the catalogue; see the module docstrings of search, chance and problem for the method.
+
+    greedy   add effects one after another as long as the error on held-out conditions falls (greedy.py), instead of
+             looking for the smallest set that explains all
+    """
+    usable = usable_effects(prepared, sources)
+    sources = usable.sources
+    prepared = replace(prepared, notes=(*prepared.notes, *usable.notes))
     search = Search(
         prepared.problem, prepared.model, prepared.nuisances, sources, jobs=jobs, progress=progress
     )
     null = search.null()
     limits = chance(search.problem, null.fit, search.signatures(null))
-    choice = _choose(search, null, limits, max_effects)
+    choose = _grow if greedy else _choose
+    choice = choose(search, null, limits, max_effects)
     search, best, limits, adequate, ranking = (
         choice.search,
         choice.best,
@@ -195,10 +210,10 @@ def diagnose(
     )
     prepared = replace(prepared, problem=search.problem)
     nothing = not best.names and adequate
-    verdict = "nothing" if nothing else "effects" if adequate else "unknown"
+    verdict = "nothing" if nothing else "effects" if adequate or (greedy and best.names) else "unknown"
     tied = _ties(choice) if verdict == "effects" else ()
     model = fitted_model(prepared.model, search, best) if best.names else prepared.model
-    falls = error_falls(prepared, search, best, progress)
+    falls = error_falls(prepared, search, best, progress, in_order=greedy)
     effects = found_effects(search, best, limits, falls)
     experiments = (
         separating_experiments(prepared, search, [search.found[tuple(sorted(n))] for n in tied])
@@ -219,7 +234,7 @@ def diagnose(
         chance=limits,
         costs={"nominal_fitted": null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
         nuisances=_nuisance_table(best.fit),
-        notes=(*prepared.notes, *_identifiability_notes(best)),
+        notes=(*prepared.notes, *choice.notes, *_identifiability_notes(best)),
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
         model=model,
@@ -237,6 +252,23 @@ class _Choice:
     adequate: bool
     ranking: tuple[Rank, ...]
     rivals: tuple[Candidate, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def _grow(search: Search, null: Candidate, limits: Chance, max_effects: int) -> _Choice:
+    """Effects one after another while the error on held-out conditions falls by at least WORTHWHILE."""
+    grown = grow(search, null, max_effects, WORTHWHILE)
+    cost = grown.best.fit.cost
+    adequate = cost <= ADEQUATE * limits.misfit
+    ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in grown.first)
+    notes = list(grown.notes)
+    if not adequate:
+        notes.append(
+            f"the misfit ({cost:.0f}) stays above what chance reaches ({limits.misfit:.0f}): something smaller is left "
+            "that the catalogue does not explain"
+        )
+    return _Choice(search, grown.best, limits, adequate, ranking, grown.rivals, tuple(notes))
+
 
 
 def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -> _Choice:
@@ -372,8 +404,13 @@ def problem_builder(prepared: Prepared, values: Mapping[str, float]) -> Any:
     return build
 
 
-def error_falls(prepared: Prepared, search: Search, best: Candidate, progress: Progress) -> tuple[Fall, ...]:
-    """Nominal as given, nominal fitted, then the effects one after another in the order that helps most."""
+def error_falls(
+    prepared: Prepared, search: Search, best: Candidate, progress: Progress, *, in_order: bool = False
+) -> tuple[Fall, ...]:
+    """Nominal as given, nominal fitted, then the effects one after another in the order that helps most.
+
+    in_order   take the effects in the order in which they stand
+    """
     problem, features = prepared.problem, prepared.features
     build = problem_builder(prepared, best.fit.values)
     nominal = signal_errors(features, features.closures(prepared.rig, prepared.model, {}))
@@ -393,18 +430,19 @@ def error_falls(prepared: Prepared, search: Search, best: Candidate, progress: P
         options = [
             search.found.get(tuple(sorted((*chain, name))))
             or search.add(search.found[tuple(sorted(chain))], name)
-            for name in left
+            for name in (left[:1] if in_order else left)
         ]
-        pick = min(range(len(left)), key=lambda k: options[k].penalised) if len(left) > 1 else 0
+        pick = min(range(len(options)), key=lambda k: options[k].penalised)
         chain = (*chain, left[pick])
         steps.append((left.pop(pick), options[pick]))
     for k, (label, candidate) in enumerate(steps):
         progress(k, len(steps), f"held-out error: {label}")
         f = candidate.fit
         train, test = held_out_closures(build, features, f.model, f.coordinates, f.z)
-        by_condition = held_out_conditions(problem, f.model, f.coordinates, f.z)
+        held = held_out_condition_errors(problem, f.model, f.coordinates, f.z)
+        by_condition = {condition: overall(own) for condition, own in held.items()}
         errors = signal_errors(features, features.closures(prepared.rig, f.model, f.values))
-        falls.append(Fall(label, train, test, by_condition, errors))
+        falls.append(Fall(label, train, test, by_condition, errors, per_signal(features, held.values())))
     return tuple(falls)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -78,6 +78,18 @@ def overall(errors: Sequence[SignalError]) -> float:
     return float(np.sqrt((ratios**2).mean())) if ratios.size else float("nan")
 
 
+def per_signal(features: Features, errors: Iterable[Sequence[SignalError]]) -> dict[str, float]:
+    """Root mean square error of each signal over the conditions, weighted by their duration, in the signal's unit."""
+    duration = {(b.condition, b.signal): float(b.phase[-1] - b.phase[0]) for b in features.blocks}
+    total: dict[str, float] = {}
+    weight: dict[str, float] = {}
+    for e in (e for own in errors for e in own):
+        seconds = duration[(e.condition, e.signal)]
+        total[e.signal] = total.get(e.signal, 0.0) + seconds * e.rmse**2
+        weight[e.signal] = weight.get(e.signal, 0.0) + seconds
+    return {signal: float(np.sqrt(total[signal] / weight[signal])) for signal in total}
+
+
 def split_closures(features: Features) -> tuple[Features, Features]:
     """Training and held-out closures: every second closure of each block is held out."""
 
@@ -116,20 +128,38 @@ def held_out_closures(
 
 
 def held_out_conditions(
-    problem: Problem, model: Model, coordinates: Sequence[Coordinate], start: Array
+    problem: Problem,
+    model: Model,
+    coordinates: Sequence[Coordinate],
+    start: Array,
+    known: Mapping[str, Array] | None = None,
 ) -> dict[str, float]:
-    """Overall error on each condition when it took no part in the fit.
+    """Overall error on each condition when it took no part in the fit; see held_out_condition_errors."""
+    errors = held_out_condition_errors(problem, model, coordinates, start, known)
+    return {condition: overall(own) for condition, own in errors.items()}
+
+
+def held_out_condition_errors(
+    problem: Problem,
+    model: Model,
+    coordinates: Sequence[Coordinate],
+    start: Array,
+    known: Mapping[str, Array] | None = None,
+) -> dict[str, tuple[SignalError, ...]]:
+    """Errors on each condition when it took no part in the fit.
 
     Parameters of the held-out recording alone (its object, its encoder zero: `name@condition`) cannot be known from the
     others; they are then fitted on the held-out condition with everything else kept.
+
+    known   derivatives (size,) by coordinate name that are taken as constant
     """
     features = problem.features
-    out: dict[str, float] = {}
+    out: dict[str, tuple[SignalError, ...]] = {}
     if len(features.conditions) < 2:
         return out
     for condition in features.conditions:
         rows = features.rows(condition)
-        found = fit(problem, model, coordinates, start, rows=~rows, evaluations=6)
+        found = fit(problem, model, coordinates, start, rows=~rows, known=known, evaluations=6)
         trial = features.trials[next(b.trial for b in features.blocks if b.condition == condition)].name
         own = [c for c in coordinates if c.name.endswith(f"@{trial}")]
         values = found.values
@@ -137,7 +167,7 @@ def held_out_conditions(
             local = _Fixed(problem, {n: v for n, v in values.items() if n not in {c.name for c in own}})
             values = {**values, **fit(local, model, own, {}, rows=rows, evaluations=6).values}
         errors = signal_errors(features, features.closures(problem.rig, model, values))
-        out[condition] = overall([e for e in errors if e.condition == condition])
+        out[condition] = tuple(e for e in errors if e.condition == condition)
     return out
 
 

@@ -29,8 +29,12 @@ Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 Names = tuple[str, ...]
 
-STRENGTHS = (0.15, 0.5, 1.5, 4.0)
-"""Strengths of the scan, in typical values; both signs where the bounds allow."""
+STRENGTHS = (0.01, 0.1, 1.0, 4.0)
+"""Strengths of the scan, in typical values; both signs where the bounds allow.  Each point is followed to where the
+straight line through it and the point without the effect says that the best strength is."""
+
+FOLLOW = 3
+"""Points of a scan that are followed."""
 
 
 @dataclass(frozen=True)
@@ -120,22 +124,51 @@ class Search:
                 low, high = c.bounds
                 points = [c.z(v) for v in p.starts] or [z for s in STRENGTHS for z in (s, -s)]
                 strengths.append([(c.name, z) for z in points if low <= z <= high])
-        trials: list[dict[str, float]] = []
+        trials: list[tuple[dict[str, float], tuple[str, float]]] = []
         for shape in itertools.product(*shapes):
             for group in strengths:
-                trials += [dict((*shape, one)) for one in group]
+                trials += [(dict((*shape, one)), one) for one in group]
         scored: list[list[tuple[float, dict[str, float]]]] = []
         for point in (base, self.prior_point(base)):
             here = {c.name: float(z) for c, z in zip(point.coordinates, point.z, strict=True)}
-            scores = []
-            for start in trials:
+
+            def at(start: Mapping[str, float], here: dict[str, float] = here) -> Array:
                 z = {**here, **start}
-                values = {c.name: c.value(z.get(c.name, 0.0)) for c in coordinates}
-                cost, z_base = self.compensated(self.problem.residual(model, values), point)
+                return self.problem.residual(
+                    model, {c.name: c.value(z.get(c.name, 0.0)) for c in coordinates}
+                )
+
+            def score(
+                start: dict[str, float], residual: Array, point: Fit = point
+            ) -> tuple[float, dict[str, float]]:
+                cost, z_base = self.compensated(residual, point)
                 moved = {c.name: float(v) for c, v in zip(point.coordinates, z_base, strict=True)}
-                scores.append((cost, {**moved, **start}))
+                return cost, {**moved, **start}
+
+            scores, follow = [], []
+            for start, (strength, z_strength) in trials:
+                residual = at(start)
+                scores.append(score(start, residual))
+                if z_strength != 0.0:
+                    cost, best = self.followed((residual - point.residual) / z_strength, point)
+                    low, high = own[strength].bounds
+                    if 0.05 < best / z_strength < 20.0 and low <= best <= high:
+                        follow.append((cost, {**start, strength: best}))
+            for _, start in sorted(follow, key=lambda item: item[0])[:FOLLOW]:
+                scores.append(score(start, at(start)))
             scored.append(sorted(scores, key=lambda item: item[0])[:keep])
         return sorted((one for scores in scored for one in scores), key=lambda item: item[0])
+
+    def followed(self, derivative: Array, base: Fit) -> tuple[float, float]:
+        """Least cost along one more direction, with the base fit's coordinates compensating, and how far along it."""
+        use = slice(None) if self.rows is None else self.rows
+        prior = np.array([1.0 if c.prior else 0.0 for c in base.coordinates])
+        j = np.column_stack([base.jacobian[use], derivative[use]])
+        weight = np.diag([*np.maximum(prior, 1e-9), 0.0])
+        r = base.residual[use]
+        step = -np.linalg.lstsq(j.T @ j + weight, j.T @ r + np.append(prior * base.z, 0.0), rcond=None)[0]
+        moved, z = r + j @ step, base.z + step[:-1]
+        return float(moved @ moved + (prior * z) @ (prior * z)), float(step[-1])
 
     def prior_point(self, base: Fit) -> Fit:
         """The base's effects with the nuisance parameters back at their nominal values.
@@ -222,19 +255,19 @@ class Search:
             for name in names:
                 if name not in base.names:
                     todo.setdefault(tuple(sorted((*base.names, name))), (base, name))
-        scans = self._each(_scan_in_worker, list(todo.values()), f"{text}: scan")
+        scans = self.each(_scan_in_worker, list(todo.values()), f"{text}: scan")
         order = sorted(zip(todo.values(), scans, strict=True), key=lambda item: item[1][0][0])
         chosen = [(base, name, [s for _, s in starts]) for (base, name), starts in order[:REFIT]]
-        refitted = self._each(_add_in_worker, chosen, f"{text}: refit")
+        refitted = self.each(_add_in_worker, chosen, f"{text}: refit")
         for candidate in refitted:
             self.found[tuple(sorted(candidate.names))] = candidate
         ranked = sorted(refitted, key=lambda c: c.penalised)
-        polished = self._each(_polish_in_worker, [(c,) for c in ranked[:POLISH]], f"{text}: polish")
+        polished = self.each(_polish_in_worker, [(c,) for c in ranked[:POLISH]], f"{text}: polish")
         for candidate in polished:
             self.found[tuple(sorted(candidate.names))] = candidate
         return sorted([*polished, *ranked[POLISH:]], key=lambda c: c.penalised)
 
-    def _each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
+    def each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
         """function(search, *item) for every item, in this process or in workers; the same results either way."""
         out = []
         if self.jobs == 1 or len(items) < 2:
