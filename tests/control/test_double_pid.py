@@ -85,3 +85,11 @@ def test_profiles() -> None:
         make_profile("half_sine", amplitude=-1.0)
     with pytest.raises(HannesError, match="speed"):
         make_profile("half_sine", speed=2.0)
+
+
+def test_an_identified_motor_does_not_change_the_controller() -> None:
+    """The gains were set once; a fit that finds another resistance must leave them as they are."""
+    nominal = load_parameters("hannes")
+    other = nominal.with_values({"motor.resistance": 1.7, "motor.inductance": 2e-4, "motor.kt": 0.018})
+    assert DoublePIDParameters.from_parameters(other) == DoublePIDParameters.from_parameters(nominal)
+    assert DoublePIDParameters.from_parameters(nominal).current_ki == pytest.approx(1.49 / 0.005)

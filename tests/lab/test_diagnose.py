@@ -107,7 +107,8 @@ def test_add_writes_a_model_whose_error_is_low_as_given(tmp_path: Path) -> None:
     model = Model.load(addition.model.save(tmp_path / "hand.yaml"))
     before = compare(prepared)
     after = compare(prepare(prepared.features.trials, model))
-    assert after.overall < 0.5 * before.overall
+    # as given: where the object lay and the encoder's zero of these recordings are not part of a model of the hand
+    assert after.overall < 0.2 * before.overall
     assert model.provenance["bags"] and model.provenance["falls"][-1]["added"] == "glove_stiffness"
     assert sum(c.fails for c in before.cells) > sum(c.fails for c in after.cells)
 

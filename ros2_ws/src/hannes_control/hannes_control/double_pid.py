@@ -81,16 +81,17 @@ class DoublePIDParameters:
     def from_parameters(cls, parameters: ParameterSet) -> DoublePIDParameters:
         """Gains from a parameter set: groups `control`, `motor` and `supply`.
 
-        The inner loop cancels the winding's pole: kp = L/tau, ki = R/tau give a closed loop of time constant tau.
+        The gains are numbers of their own: they were set once, and a motor that turns out to be another (an identified
+        resistance) does not change them.  kp = L/tau and ki = R/tau cancel the winding's pole and give a closed current
+        loop of time constant tau.
         """
         c, m = parameters.values_of("control"), parameters.values_of("motor")
-        tau = c["current_time_constant"]
         return cls(
             kp=c["kp"],
             damping=c["damping"],
             velocity_filter=c["velocity_filter"],
-            current_kp=m["inductance"] / tau,
-            current_ki=m["resistance"] / tau,
+            current_kp=c["current_kp"],
+            current_ki=c["current_ki"],
             current_limit=m["current_limit"],
             voltage_limit=parameters.value("supply.voltage"),
             saver_current=c["saver_current"],

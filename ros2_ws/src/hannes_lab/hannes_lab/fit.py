@@ -16,6 +16,11 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
+SMALLEST_STRENGTH = 0.02
+"""In typical values: an effect weaker than this is stepped as if it were this strong, well above the roughness of a
+simulation with dry friction."""
+
+
 @dataclass(frozen=True)
 class Fit:
     """A fitted point.
@@ -68,7 +73,7 @@ def finite_differences(
     for k, j in enumerate(columns):
         c = coordinates[j]
         low, high = c.bounds
-        step = c.step * max(1.0, abs(z[j])) if not c.prior else c.step
+        step = c.step if c.prior or c.log else c.step * max(abs(z[j]), SMALLEST_STRENGTH)
         if z[j] + step > high:
             step = -step
         if z[j] + step < low:

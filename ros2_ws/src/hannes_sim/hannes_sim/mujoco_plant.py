@@ -275,7 +275,9 @@ class MujocoPlant:
         for name, index in _NAMES.items():
             if name in self._values:
                 self.parameters[index] = self._values.value(name)
-        self.parameters[P_KT_NOMINAL] = self._values.value("motor.kt")
+        self.parameters[P_KT_NOMINAL] = self._values.value(
+            "control.motor_kt" if "control.motor_kt" in self._values else "motor.kt"
+        )
         self._build()
         self.reset()
 

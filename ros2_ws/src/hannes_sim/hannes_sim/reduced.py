@@ -235,7 +235,9 @@ class ReducedPlant:
         for name, index in _NAMES.items():
             if name in values:
                 self.parameters[index] = values.value(name)
-        self.parameters[P_KT_NOMINAL] = values.value("motor.kt")
+        self.parameters[P_KT_NOMINAL] = values.value(
+            "control.motor_kt" if "control.motor_kt" in values else "motor.kt"
+        )
         self._armature = values.value("motor.armature")
         self._update_inertia()
         self.parameters[_OBJECT_AT] = NO_OBJECT

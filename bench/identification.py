@@ -1,0 +1,369 @@
+"""How well the lab finds hidden effects: `python bench/identification.py [--sets ...] [--quick] [--jobs N]`.
+
+Makes measurement sets with `hide` (hand of the population, scatter, the thesis' sensors), diagnoses each blind, and prints
+a table of verdicts.  Every case is kept in a file named by its content and the sources' hash, so that an interrupted run
+goes on where it stopped.  The seeds differ from those on which thresholds were set.
+
+    nothing   nothing hidden
+    single    one effect of the catalogue at 1.5, 2, 3, 5 and 8 times its detection limit
+    pairs     two effects at three times their limits
+    outside   effects of bench/outside_effects.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import itertools
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hannes_description.errors import HannesError
+from hannes_description.model import EffectEntry, Model
+from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.hide import make_set
+from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.search import Search
+from hannes_lab.trials import make_trial
+from hannes_sim.effect import catalogue, effect_source, load_effect
+from joblib import Parallel, delayed
+
+SETS = ("nothing", "single", "pairs", "outside")
+FACTORS = (1.5, 2.0, 3.0, 5.0, 8.0)
+JUDGING_SEED = 50_000
+"""First seed of the sets that are judged; thresholds were set on seeds below 1000."""
+
+DETECTABLE = 60.0
+"""Fall of the cost at which an effect counts as detectable: about three times what chance gains."""
+
+OUTSIDE = Path(__file__).with_name("outside_effects.py")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One measurement set: effects as (name or path.py:Class, parameter values)."""
+
+    kind: str
+    effects: tuple[tuple[str, tuple[tuple[str, float], ...]], ...]
+    factor: float
+    seed: int
+    closures: int = 13
+    sensors: str = "thesis"
+
+    @property
+    def key(self) -> str:
+        return hashlib.sha256(json.dumps([asdict(self), source_hash()], sort_keys=True).encode()).hexdigest()[
+            :20
+        ]
+
+    def entries(self) -> list[EffectEntry]:
+        out = []
+        for name, values in self.effects:
+            kind = load_effect(name)
+            out.append(kind.entry(dict(values), source=effect_source(kind, name)))
+        return out
+
+
+_HASH: list[str] = []
+
+
+def source_hash() -> str:
+    """Hash of everything that a result depends on."""
+    if not _HASH:
+        root = Path(__file__).resolve().parents[1] / "ros2_ws" / "src"
+        digest = hashlib.sha256()
+        for package in ("hannes_description", "hannes_sim", "hannes_control", "hannes_lab"):
+            for file in sorted((root / package / package).rglob("*")):
+                if file.suffix in (".py", ".yaml") and not file.name.startswith(("report", "pictures")):
+                    digest.update(file.read_bytes())
+        digest.update(OUTSIDE.read_bytes())
+        _HASH.append(digest.hexdigest())
+    return _HASH[0]
+
+
+def run_case(case: Case) -> dict[str, Any]:
+    """Make the set, diagnose it blind, and compare with the truth."""
+    model = Model.load()
+    recordings, truth = make_set(
+        model, case.entries(), seed=case.seed, closures=case.closures, sensors=case.sensors
+    )
+    start = time.monotonic()
+    prepared = prepare([make_trial(r) for r in recordings], model)
+    found = diagnose(prepared, effect_sources(model=model))
+    hidden = sorted(e.name for e in truth.effects)
+    named = sorted(e.name for e in found.effects)
+    inside = []
+    if found.verdict == "effects" and named == hidden:
+        for effect in truth.effects:
+            estimate = next(e for e in found.effects if e.name == effect.name)
+            for p in load_effect(effect.source or effect.name).parameters:
+                if p.vanishing is not None and effect.values[p.name] != p.vanishing:
+                    e = estimate.parameters[p.name]
+                    true = effect.values[p.name]
+                    inside.append(bool(e.low <= true <= e.high or abs(e.value - true) <= 0.1 * abs(true)))
+    return {
+        "kind": case.kind,
+        "hidden": hidden,
+        "factor": case.factor,
+        "seed": case.seed,
+        "verdict": found.verdict,
+        "named": named,
+        "tied": [sorted(t) for t in found.tied],
+        "inside": inside,
+        "costs": dict(found.costs),
+        "final": found.falls[-1].held_out,
+        "nominal": found.falls[0].held_out,
+        "seconds": time.monotonic() - start,
+        "simulations": found.simulations,
+    }
+
+
+def detection_factors(names: list[str], seed: int = 7) -> dict[str, float]:
+    """Strength, in typical values, at which each effect is just detectable: the fall of the cost reaches DETECTABLE
+    after the nuisance parameters have compensated what they can (linearly, on a set without an effect)."""
+    model = Model.load()
+    recordings, _ = make_set(model, [], seed=seed)
+    prepared: Prepared = prepare([make_trial(r) for r in recordings], model)
+    search = Search(prepared.problem, model, prepared.nuisances, effect_sources(only=names))
+    base = search.null()
+    out = {}
+    for name in names:
+        kind = load_effect(name)
+        with_effect, coordinates = search.with_effects((kind.name,))
+        here = {c.name: c.value(float(z)) for c, z in zip(base.fit.coordinates, base.fit.z, strict=True)}
+        factor = 1e-3
+        top = highest_factor(name)
+        while factor < top:
+            values = here | {f"{kind.name}.{n}": v for n, v in strength(name, factor)}
+            residual = search.problem.residual(with_effect, values) - base.fit.residual
+            flat = replace(base.fit, z=np.zeros_like(base.fit.z))
+            if search.compensated(residual, flat)[0] >= DETECTABLE:
+                break
+            factor *= 1.25
+        out[name] = min(factor, top)
+        del coordinates
+    return out
+
+
+def strength(name: str, factor: float) -> tuple[tuple[str, float], ...]:
+    """Parameters of an effect at `factor` times its typical strength; shape parameters stay typical."""
+    return tuple(
+        (p.name, float(min(max(p.typical * (factor if p.vanishing is not None else 1.0), p.lower), p.upper)))
+        for p in load_effect(name).parameters
+    )
+
+
+def highest_factor(name: str) -> float:
+    """Largest factor inside the bounds."""
+    return min(
+        (p.upper / p.typical if p.typical > 0 else np.inf)
+        for p in load_effect(name).parameters
+        if p.vanishing is not None
+    )
+
+
+def cases(kinds: list[str], limits: dict[str, float], quick: bool) -> list[Case]:
+    """All sets of the bench."""
+    out: list[Case] = []
+    names = sorted(catalogue())
+    seed = itertools.count(JUDGING_SEED)
+    if "nothing" in kinds:
+        out += [Case("nothing", (), 0.0, JUDGING_SEED + 10_000 + k) for k in range(10 if quick else 100)]
+    if "single" in kinds:
+        for name in names:
+            for factor in FACTORS[2:3] if quick else FACTORS:
+                f = min(factor * limits[name], highest_factor(name))
+                out.append(Case("single", ((name, strength(name, f)),), factor, next(seed)))
+    if "pairs" in kinds:
+        rng = np.random.default_rng(JUDGING_SEED)
+        for k in range(6 if quick else 40):
+            a, b = rng.choice(len(names), 2, replace=False)
+            chosen = [
+                (names[i], strength(names[i], min(3.0 * limits[names[i]], highest_factor(names[i]))))
+                for i in (int(a), int(b))
+            ]
+            out.append(Case("pairs", tuple(chosen), 3.0, JUDGING_SEED + 20_000 + k))
+    if "outside" in kinds:
+        import outside_effects
+
+        for k, (name, factor) in enumerate(
+            itertools.product(outside_effects.NAMES, (1.0,) if quick else (0.5, 1.0, 2.0))
+        ):
+            source = f"{OUTSIDE}:{name}"
+            out.append(
+                Case("outside", ((source, strength(source, factor)),), factor, JUDGING_SEED + 30_000 + k)
+            )
+    return out
+
+
+def table(results: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
+    """Rows: what, measured, target."""
+    rows: list[tuple[str, str, str]] = []
+
+    def share(part: list[Any], whole: list[Any]) -> str:
+        return f"{len(part)} of {len(whole)} ({100.0 * len(part) / len(whole):.0f} %)" if whole else "-"
+
+    nothing = [r for r in results if r["kind"] == "nothing"]
+    single = [r for r in results if r["kind"] == "single"]
+    pairs = [r for r in results if r["kind"] == "pairs"]
+    outside = [r for r in results if r["kind"] == "outside"]
+    if nothing:
+        rows.append(
+            (
+                "nothing hidden: false alarms",
+                share([r for r in nothing if r["verdict"] != "nothing"], nothing),
+                "at most 5 %",
+            )
+        )
+    if single:
+        exact = [
+            r
+            for r in single
+            if r["hidden"] in (r["tied"] or [r["named"]])
+            and len(r["tied"]) <= 2
+            and r["verdict"] == "effects"
+        ]
+        wrong = [r for r in single if r["verdict"] == "effects" and r["hidden"] not in r["tied"]]
+        inside = [i for r in single for i in r["inside"]]
+        rows.append(("one hidden: named, or tied with one other", share(exact, single), "95 %"))
+        rows.append(("one hidden: wrong", share(wrong, single), "at most 1 %"))
+        rows.append(
+            (
+                "one hidden: answered nothing",
+                share([r for r in single if r["verdict"] == "nothing"], single),
+                "",
+            )
+        )
+        rows.append(
+            (
+                "one hidden: answered unknown",
+                share([r for r in single if r["verdict"] == "unknown"], single),
+                "",
+            )
+        )
+        rows.append(
+            ("parameter in its interval or within 10 %", share([i for i in inside if i], inside), "90 %")
+        )
+    if pairs:
+        both = [r for r in pairs if r["hidden"] in (r["tied"] or [r["named"]])]
+        least = [
+            r
+            for r in pairs
+            if set(r["named"]) & set(r["hidden"]) or any(set(t) & set(r["hidden"]) for t in r["tied"])
+        ]
+        clean = [
+            r
+            for r in pairs
+            if set(r["named"]) <= set(r["hidden"])
+            or r["verdict"] == "unknown"
+            or any(set(t) <= set(r["hidden"]) for t in r["tied"])
+        ]
+        rows += [
+            ("two hidden: both", share(both, pairs), "75 %"),
+            ("two hidden: at least one", share(least, pairs), "100 %"),
+            ("two hidden: none wrong", share(clean, pairs), "95 %"),
+        ]
+    if outside:
+        rows.append(
+            (
+                "outside the catalogue: unknown",
+                share([r for r in outside if r["verdict"] == "unknown"], outside),
+                "90 %",
+            )
+        )
+    added = [r for r in results if r["verdict"] == "effects"]
+    if added:
+        rows.append(
+            (
+                "held-out error after adding at most 1.15 x repeatability",
+                share([r for r in added if r["final"] <= 1.15], added),
+                "90 %",
+            )
+        )
+    if results:
+        rows.append(
+            (
+                "time of a diagnosis, median / longest",
+                f"{np.median([r['seconds'] for r in results]):.0f} s / {max(r['seconds'] for r in results):.0f} s",
+                "180 s (MuJoCo plant)",
+            )
+        )
+    return rows
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--sets", default=",".join(SETS), help="which of " + ", ".join(SETS))
+    parser.add_argument("--quick", action="store_true", help="a fifth of the sets or less")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/identification"), help="folder of the kept results"
+    )
+    parser.add_argument("--list", action="store_true", help="print every result that is not as hidden")
+    options = parser.parse_args()
+    kinds = options.sets.split(",")
+    if set(kinds) - set(SETS):
+        raise HannesError(f"--sets: valid are {', '.join(SETS)}.")
+    sys.path.insert(0, str(Path(__file__).parent))
+    options.out.mkdir(parents=True, exist_ok=True)
+    limits_file = options.out / f"limits-{source_hash()[:20]}.json"
+    if limits_file.exists():
+        limits = json.loads(limits_file.read_text())
+    else:
+        limits = detection_factors(sorted(catalogue()))
+        limits_file.write_text(json.dumps(limits))
+    todo = cases(kinds, limits, options.quick)
+    results: list[dict[str, Any]] = []
+    missing = []
+    for case in todo:
+        file = options.out / f"{case.key}.json"
+        if file.exists():
+            results.append(json.loads(file.read_text()))
+        else:
+            missing.append((case, file))
+    print(f"{len(todo)} sets, {len(results)} kept from before", file=sys.stderr)
+    runs = Parallel(n_jobs=options.jobs, return_as="generator_unordered")(
+        delayed(_kept)(c, f) for c, f in missing
+    )
+    for k, result in enumerate(runs):
+        results.append(result)
+        print(
+            f"[{k + 1}/{len(missing)}] {result['kind']} {result['hidden']} -> {result['verdict']} {result['named']} "
+            f"({result['seconds']:.0f} s)",
+            file=sys.stderr,
+            flush=True,
+        )
+    if options.list:
+        for r in results:
+            if r["hidden"] != r["named"]:
+                print(
+                    json.dumps(
+                        {
+                            k: r[k]
+                            for k in ("kind", "hidden", "factor", "verdict", "named", "tied", "costs", "seed")
+                        }
+                    )
+                )
+    for what, measured, target in table(results):
+        print(f"{what:<58} {measured:>22}   {target}")
+    return 0
+
+
+def _kept(case: Case, file: Path) -> dict[str, Any]:
+    sys.path.insert(0, str(OUTSIDE.parent))
+    result = run_case(case)
+    temporary = file.with_suffix(".tmp")
+    temporary.write_text(json.dumps(result))
+    temporary.replace(file)
+    return result
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
