@@ -39,6 +39,9 @@ approximation behind the critical value."""
 WORTHWHILE = 0.05
 """A further effect must remove at least this part of the cost, and of the error on held-out conditions."""
 
+TIE = 12.0
+"""Sets whose penalised costs differ by less cannot be told apart: a likelihood ratio of e^6."""
+
 MAX_EFFECTS = 3
 
 WIDE = (4, 3)
@@ -270,7 +273,6 @@ def _grow(search: Search, null: Candidate, limits: Chance, max_effects: int) -> 
     return _Choice(search, grown.best, limits, adequate, ranking, grown.rivals, tuple(notes))
 
 
-
 def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -> _Choice:
     """Smallest adequate set of effects.
 
@@ -299,14 +301,10 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         front.sort(key=lambda c: c.penalised)
         best = new.polish(front[0])
         limits_new = chance(new.problem, best.fit, new.signatures(best))
-        close = tuple(c for c in front[1:] if c.penalised <= best.penalised + _tie_margin(limits_new))
+        close = tuple(c for c in front[1:] if c.penalised <= best.penalised + TIE)
         choice = _Choice(new, best, limits_new, best.fit.cost <= ADEQUATE * limits_new.misfit, ranking, close)
         front = [best, *front[1:]]
     return choice
-
-
-def _tie_margin(limits: Chance) -> float:
-    return max(limits.gain, 10.0)
 
 
 def _share(null: Candidate, candidate: Candidate, limits: Chance) -> float:
