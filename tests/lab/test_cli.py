@@ -1,0 +1,142 @@
+"""The lab's commands as a user types them: output, files, JSON, exit codes."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hannes_bringup.cli import main
+from hannes_description.model import Model
+
+
+def hannes(
+    *words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of one command."""
+    monkeypatch.setattr("sys.argv", ["hannes", *words])
+    try:
+        code = main()
+    except SystemExit as end:
+        code = int(end.code or 0)
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small set with a stiff glove; the truth lies beside, not inside."""
+    from hannes_lab.hide import make_set, write_set
+    from hannes_sim.effect import strength_of
+
+    folder = tmp_path_factory.mktemp("set")
+    recordings, truth = make_set(Model.load(), [strength_of("glove_stiffness", 1.0)], seed=301, closures=6)
+    write_set(recordings, truth, folder / "bags", folder / "truth.yaml")
+    return folder / "bags"
+
+
+def test_compare(bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    code, out, _ = hannes("compare", str(bags), capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and "fails" in out and "times the repeatability" in out
+    code, out, _ = hannes("compare", str(bags), "--json", capsys=capsys, monkeypatch=monkeypatch)
+    content = json.loads(out)
+    assert code == 0 and content["overall"] > 2.0 and content["metrics"] and content["cells"]
+
+
+def test_diagnose_add_and_report(
+    bags: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, page = tmp_path / "my_hand.yaml", tmp_path / "report.html"
+    only = [
+        word for name in ("glove_stiffness", "wire_slack", "gearbox_inertia") for word in ("--only", name)
+    ]
+    words = (
+        "diagnose",
+        str(bags),
+        *only,
+        "--add",
+        "--out",
+        str(model),
+        "--report",
+        str(page),
+        "--json",
+        "--jobs",
+        "1",
+    )
+    code, out, _ = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    content = json.loads(out)
+    assert code == 0 and content["verdict"] == "effects"
+    assert [e["name"] for e in content["effects"]] == ["glove_stiffness"]
+    assert [e.name for e in Model.load(model).effects] == ["glove_stiffness"]
+    assert "glove" in page.read_text(encoding="utf-8") and content["model_file"] == str(model)
+    # with the effect in the model, nothing is missing any more
+    code, out, _ = hannes(
+        "compare",
+        str(bags),
+        "--model",
+        str(model),
+        "--fitted",
+        "--json",
+        capsys=capsys,
+        monkeypatch=monkeypatch,
+    )
+    assert code == 0 and json.loads(out)["overall"] < 1.3
+
+
+def test_hide_keeps_the_truth_away_from_the_bags(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = (
+        "hide",
+        str(tmp_path / "set"),
+        "--truth",
+        str(tmp_path / "truth.yaml"),
+        "--effect",
+        "wire_slack=2",
+        "--closures",
+        "2",
+        "--condition",
+        "fast",
+    )
+    code, _, _ = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0
+    assert "wire_slack" in (tmp_path / "truth.yaml").read_text()
+    for file in (tmp_path / "set").rglob("*"):
+        if file.is_file():
+            assert b"slack" not in file.read_bytes()
+    code, _, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 2 and "exists already" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("compare", "no/such/bag"), "does not exist"),
+        (("diagnose", "BAGS", "--effect", "wire_slak"), "Unknown effect"),
+        (("diagnose", "BAGS", "--model", "nothing"), "No model"),
+        (("add", "BAGS", "--effect", "mine.py:Mine"), "No file"),
+        (("compare", "BAGS", "--object", "slow"), "CONDITION="),
+        (("compare", "BAGS", "--object", "quick=soft"), "unknown conditions"),
+        (("compare", "EMPTY"), "holds no bag"),
+        (("hide", "OUT", "--truth", "T", "--effect", "wire_slack=much"), "wire_slack=much"),
+        (("hide", "OUT", "--truth", "T", "--condition", "quick"), "slow"),
+    ],
+)
+def test_a_mistake_gives_one_line_and_exit_code_2(
+    words: tuple[str, ...],
+    message: str,
+    bags: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    places = {
+        "BAGS": str(bags),
+        "EMPTY": str(empty),
+        "OUT": str(tmp_path / "out"),
+        "T": str(tmp_path / "t.yaml"),
+    }
+    code, _, err = hannes(*(places.get(word, word) for word in words), capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 2
+    assert message in err and "Traceback" not in err
+    assert len(err.strip().splitlines()) == 1
