@@ -1,0 +1,100 @@
+"""Parameters with provenance, and model files: what is refused, and what comes back unchanged."""
+
+from pathlib import Path
+
+import pytest
+from hannes_description.errors import HannesError
+from hannes_description.model import EffectEntry, Model
+from hannes_description.parameters import Parameter, ParameterSet, load_parameters
+from hannes_sim.effect import load_effect
+
+
+def test_every_shipped_number_has_unit_bounds_status_and_source() -> None:
+    parameters = load_parameters("hannes")
+    assert len(parameters) > 30
+    for name, p in parameters.items():
+        assert p.unit and p.source and p.lower <= p.value <= p.upper, name
+
+
+def test_a_model_file_comes_back_the_same(tmp_path: Path) -> None:
+    effect = load_effect("stribeck_friction")
+    model = (
+        Model.load()
+        .with_values({"motor.resistance": 1.0 / 3.0 + 1.2})
+        .with_effect(effect.entry({"stiction": 0.1 / 3.0}))
+    )
+    again = Model.load(model.save(tmp_path / "m.yaml"))
+    assert again.sha256 == model.sha256
+    assert again.parameters.value("motor.resistance") == 1.0 / 3.0 + 1.2
+    assert again.effects[0].values["stiction"] == 0.1 / 3.0
+
+
+def test_the_hash_tells_simulations_apart_not_names() -> None:
+    from dataclasses import replace
+
+    model = Model.load()
+    assert replace(model, name="other", provenance={"a": 1}).sha256 == model.sha256
+    assert model.with_values({"motor.kt": 0.018}).sha256 != model.sha256
+    assert model.with_plant("mujoco").sha256 != model.sha256
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("schema: hannes/model/2\n", "schema"),
+        ("schema: hannes/model/1\nspeed: 3\n", r"unknown keys \['speed'\]"),
+        ("schema: hannes/model/1\noverrides: {motor.resistence: {value: 1}}\n", r"motor\.resistance"),
+        ("schema: hannes/model/1\noverrides: {motor.resistance: {value: 1}}\n", "missing keys"),
+        ("schema: hannes/model/1\nparameters: nobody\n", "shipped are"),
+        ("schema: hannes/model/1\neffects: [{name: x}]\n", "every effect needs"),
+        ("schema: [\n", "not valid YAML"),
+        ("- 1\n", "must be a mapping"),
+        ("schema: !!python/object/apply:os.system [ls]\n", "not valid YAML"),
+        ("a: " + "[" * 20000, "not valid YAML"),
+    ],
+)
+def test_a_broken_model_file_gives_one_clear_error(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "broken.yaml"
+    file.write_text(text)
+    with pytest.raises(HannesError, match=message) as caught:
+        Model.load(file)
+    assert (
+        str(file) in str(caught.value)
+        or "shipped" in str(caught.value)
+        or "Unknown parameter" in str(caught.value)
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "lower", "upper", "status", "message"),
+    [
+        (2.0, 0.0, 1.0, "assumed", "outside its bounds"),
+        (float("nan"), 0.0, 1.0, "assumed", "finite"),
+        (0.5, 0.0, 1.0, "guessed", "datasheet"),
+    ],
+)
+def test_a_wrong_parameter_is_refused(
+    value: float, lower: float, upper: float, status: str, message: str
+) -> None:
+    with pytest.raises(HannesError, match=message):
+        Parameter(value, "V", lower, upper, status, "test")
+
+
+def test_unknown_names_list_their_group() -> None:
+    with pytest.raises(HannesError, match=r"motor\.resistance, motor\.inductance"):
+        load_parameters("hannes")["motor.resistanse"]
+    with pytest.raises(HannesError, match="No parameter group"):
+        ParameterSet({}, "x").values_of("motor")
+
+
+def test_an_effect_twice_is_refused() -> None:
+    entry = EffectEntry("a", {})
+    with pytest.raises(HannesError, match="listed twice"):
+        Model("m", "reduced", load_parameters("hannes"), effects=(entry, entry))
+
+
+def test_unreadable_and_missing_files(tmp_path: Path) -> None:
+    with pytest.raises(HannesError, match="Cannot read"):
+        Model.load(tmp_path / "none.yaml")
+    with pytest.raises(HannesError, match="nominal"):
+        Model.load("none")
