@@ -18,11 +18,17 @@ from hannes_description.model import Model
 from .table import Figure, Section
 
 LEVER = 0.24
-"""Where the force acts, as a share of the distance from the joint to the tip pad; see `run`."""
+"""Where the force acts, as a share of the distance from the joint to the tip pad, in a model that does not say; see
+`run`."""
 
 SIMULATED = {"thumb": 3.51, "index": 1.65, "middle": 2.46, "ring": 1.83, "little": 0.99}
 ANALYTIC = {"thumb": 3.66, "index": 1.66, "middle": 2.42, "ring": 1.83, "little": 0.99}
 """N; the thesis' values."""
+
+
+def lever_of(model: Model) -> float:
+    """The lever that a calibrated model was solved for, from its provenance."""
+    return float(model.provenance.get("lever", LEVER))
 
 
 def distal(digit: str) -> tuple[str, str, str]:
@@ -34,7 +40,7 @@ def distal(digit: str) -> tuple[str, str, str]:
 
 def gravity_moment(model: Model, digit: str) -> float:
     """N.m with which gravity flexes the distal joint of the open hand."""
-    joint, name, _ = distal(digit)
+    _, name, _ = distal(digit)
     tree = links(model.parameters, Variant.of(model.variant).thumb_stop_deg)
     link = next(k for k in tree if k.name == name)
     if link.joint is None:
@@ -117,11 +123,12 @@ def onset(model: Model, digit: str, lever: float = LEVER, *, friction: bool = Fa
 def run(model: Model, dt: float = 0.25e-3) -> Section:
     """R04: thesis' analytic value, our balance, our simulation, with the return wire."""
     figures = []
-    own, rubbing = balance(model), balance(model, friction=True)
+    lever = lever_of(model)
+    own, rubbing = balance(model, lever), balance(model, lever, friction=True)
     simulated, stuck = {}, {}
     for digit in ("thumb", "index", "middle", "ring", "little"):
-        simulated[digit] = onset(model, digit, dt=dt)
-        stuck[digit] = onset(model, digit, friction=True, dt=dt)
+        simulated[digit] = onset(model, digit, lever, dt=dt)
+        stuck[digit] = onset(model, digit, lever, friction=True, dt=dt)
         thesis = own[digit] * SIMULATED[digit] / ANALYTIC[digit]
         figures.append(Figure("R04", f"{digit}, least force, simulated onset against balance", "N", own[digit], thesis,
                               simulated[digit], limit=0.005))
@@ -133,9 +140,11 @@ def run(model: Model, dt: float = 0.25e-3) -> Section:
                               float("nan"), own[digit], limit=0.005, role="fitted"))
     notes = (
         f"The thesis gives forces, not where they act. With the force at the tip the preloads would ask more current "
-        f"to close than R07 gives. Here it acts at {LEVER:g} of the distance from joint to tip pad on every digit; "
+        f"to close than R07 gives. Here it acts at {lever:.3g} of the distance from joint to tip pad on every digit; "
         "five preloads are then solved from the five analytic forces, so that the last five lines are met by "
         "construction. Lever and preload are told apart by the void current alone.",
+        "The thesis' forces are rounded to 0.01 N, up to 0.5 % of them: where its error is printed as 0, being closer is "
+        "not defined.",
         "Joint before the distal one held, flexor wires slack, palm down; the thesis' column is its simulation's error "
         "on the same balance.")
     return Section(("R04",), "least force that moves the distal phalanx", tuple(figures), notes)

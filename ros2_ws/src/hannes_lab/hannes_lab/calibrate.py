@@ -1,0 +1,424 @@
+"""Calibration: named parameters of a model identified from recordings, or from published figures.
+
+    z* = argmin |r(z)|^2 + |z|^2        r: whitened residual (Problem, or TargetProblem); z: standard deviations from the
+                                        prior's mean, inside the bounds
+
+from several starts; intervals from the curvature at the best.  A parameter whose posterior is hardly narrower than its
+prior is not identified by the data; of two whose effects on the data are nearly proportional only one combination is.
+Every simulation's residual is kept in a folder under the hash of all that determines it, so that a stopped calibration
+goes on where it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+from hannes_description.errors import HannesError
+from hannes_description.model import EffectEntry, Model
+from hannes_description.parameters import Parameter, data_path, read_yaml
+from hannes_sim.plant import PlantDiverged
+from numpy.typing import NDArray
+
+from .errors import held_out_closures, overall, signal_errors
+from .features import data_used
+from .fit import Fit, fit
+from .hand import HandRig
+from .prepare import Prepared
+from .problem import FAILED, Coordinate, Problem, build_problem, nuisance_coordinate
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int, str], None]
+
+DEFAULT_SD = 0.3
+"""Prior standard deviation of a free parameter without one of its own: of its logarithm, or of its bounds' span."""
+
+WIDEN = 3.0
+"""A freed parameter may lie this many times farther from nominal than the population's tolerance says."""
+
+UNIDENTIFIED = 0.7
+"""Posterior over prior standard deviation above which the data say next to nothing."""
+
+CONFOUNDED = 0.95
+"""Correlation of two parameters' posterior, priors aside, above which they cannot be told apart."""
+
+SPREAD = 0.5
+"""Scatter of the further starts, in prior standard deviations."""
+
+STEP = 0.02
+"""Finite-difference step: of the logarithm, or of the prior's standard deviation."""
+
+
+class Residuals(Protocol):
+    """What is fitted: `features.size` whitened residuals of a model with some values (Problem is one)."""
+
+    @property
+    def features(self) -> Any: ...
+
+    def residual(self, model: Model, values: Mapping[str, float]) -> Array: ...
+
+
+@dataclass(frozen=True)
+class Target:
+    """A published figure to be reached: value and standard deviation in its unit, and the row it stands in."""
+
+    name: str
+    row: str
+    value: float
+    sd: float
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.value) and math.isfinite(self.sd) and self.sd > 0.0):
+            raise HannesError(f"Target '{self.name}': value {self.value} and sd {self.sd} must be finite, sd positive.")
+
+
+@dataclass(frozen=True)
+class _Size:
+    size: int
+
+
+@dataclass
+class TargetProblem:
+    """Published figures as a least-squares problem: residual = (target - predicted) / sd.
+
+    predict  (model, values) -> figures by target name
+    digest   what else determines the prediction (the object, the step), for the cache's key
+    """
+
+    targets: tuple[Target, ...]
+    predict: Callable[[Model, Mapping[str, float]], Mapping[str, float]]
+    digest: str = ""
+    simulations: int = 0
+
+    @property
+    def features(self) -> _Size:
+        return _Size(len(self.targets))
+
+    @property
+    def key(self) -> str:
+        return json.dumps([[t.name, t.value, t.sd] for t in self.targets]) + self.digest
+
+    def residual(self, model: Model, values: Mapping[str, float]) -> Array:
+        """Residual (n,) in standard deviations; FAILED where the simulation diverges, 30 where a figure is missing."""
+        self.simulations += 1
+        try:
+            found = self.predict(model, values)
+        except PlantDiverged:
+            return np.full(len(self.targets), FAILED)
+        out = np.array([(t.value - found[t.name]) / t.sd for t in self.targets])
+        return np.where(np.isfinite(out), out, 30.0)
+
+
+class Remembered:
+    """A problem whose residuals are kept in a folder, content-addressed; `folder` None keeps nothing."""
+
+    def __init__(self, problem: Any, key: str, folder: Path | None, progress: Progress | None = None) -> None:
+        self.problem, self.key, self.folder = problem, key, folder
+        self.hits = 0
+        self.done = 0
+        self._progress = progress
+        self.total, self.text = 1, "simulation"
+        if folder is not None:
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise HannesError(f"Cannot use the cache folder '{folder}': {error}; give another --cache.") from error
+
+    @property
+    def features(self) -> Any:
+        return self.problem.features
+
+    def residual(self, model: Model, values: Mapping[str, float]) -> Array:
+        """The residual, from the folder where it is there."""
+        self.done += 1
+        if self._progress is not None:
+            self._progress(self.done, max(self.total, self.done), self.text)
+        if self.folder is None:
+            return np.asarray(self.problem.residual(model, values), dtype=np.float64)
+        text = self.key + model.sha256 + json.dumps(sorted((k, float(v)) for k, v in values.items()))
+        path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()}.npy"
+        if path.exists():
+            try:
+                kept = np.load(path, allow_pickle=False)
+                if kept.shape == (self.problem.features.size,):
+                    self.hits += 1
+                    return np.asarray(kept, dtype=np.float64)
+            except (OSError, ValueError):
+                path.unlink(missing_ok=True)  # cut off while it was written; it is made again
+        out = np.asarray(self.problem.residual(model, values), dtype=np.float64)
+        part = path.with_suffix(f".{os.getpid()}.part")
+        with part.open("wb") as file:
+            np.save(file, out, allow_pickle=False)
+        part.replace(path)
+        return out
+
+
+def default_cache() -> Path:
+    """Where residuals are kept when nothing else is said."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hannes" / "calibrate"
+
+
+@dataclass(frozen=True)
+class Identified:
+    """One calibrated parameter.
+
+    low, high   95 % interval
+    narrowing   posterior over prior standard deviation
+    identified  the data narrowed it and nothing else can take its place
+    confounded  the parameter that it cannot be told apart from, with their correlation
+    at_bound    the best value lies on a bound
+    """
+
+    name: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    narrowing: float
+    identified: bool
+    confounded: str | None = None
+    correlation: float = 0.0
+    at_bound: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        return self.__dict__.copy()
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a calibration found.
+
+    costs    least-squares cost of every start's end, best first; agree: how many ended within 1 % of the best
+    errors   training and held-out error in multiples of the repeatability (recordings), before and after
+    """
+
+    model: Model
+    parameters: tuple[Identified, ...]
+    costs: tuple[float, ...]
+    agree: int
+    errors: Mapping[str, float]
+    warnings: tuple[str, ...]
+    simulations: int
+    from_cache: int
+    best: Fit = field(repr=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"model": {"name": self.model.name, "sha256": self.model.sha256},
+                "parameters": [p.to_dict() for p in self.parameters], "costs": list(self.costs), "agree": self.agree,
+                "errors": dict(self.errors), "warnings": list(self.warnings), "simulations": self.simulations,
+                "from_cache": self.from_cache}
+
+
+def free_coordinates(model: Model, names: Sequence[str], sds: Mapping[str, float] | None = None) -> list[Coordinate]:
+    """Coordinates of named parameters of a model or of its effects, with bounds and priors.
+
+    sds  prior standard deviation by name: of the logarithm for positive parameters, else in the parameter's unit
+    Raises HannesError for unknown or repeated names.
+    """
+    if not names:
+        raise HannesError("Nothing is free: give --free NAME,NAME (see `hannes model show` for the names).")
+    twice = sorted({n for n in names if list(names).count(n) > 1})
+    if twice:
+        raise HannesError(f"--free names {', '.join(twice)} twice.")
+    table = read_yaml(data_path("parameters", "population.yaml"), "population file")
+    own = {f"{e.name}.{n}": p for e in model.effects for n, p in e.parameters.items()}
+    out = []
+    for name in names:
+        p = own[name] if name in own else model.parameters[name]
+        log = p.lower >= 0.0 and p.value > 0.0
+        sd = (sds or {}).get(name)
+        if sd is None:
+            known = table.get(name)
+            sd = WIDEN * float(known["hand_sd"]) if known and log else DEFAULT_SD * (1.0 if log else p.upper - p.lower)
+        if not (math.isfinite(sd) and sd > 0.0):
+            raise HannesError(f"The prior of '{name}' has the standard deviation {sd}; it must be positive.")
+        out.append(Coordinate(name, p.value, sd, log, max(p.lower, 1e-3 * p.value) if log else p.lower, p.upper, True,
+                              STEP / sd if log else STEP, p.unit))
+    return out
+
+
+def search(problem: Residuals, model: Model, coordinates: Sequence[Coordinate], *, starts: int = 3, seed: int = 0,
+           evaluations: int = 15, first: Mapping[str, float] | None = None,
+           announce: Callable[[int, int], None] | None = None) -> list[Fit]:
+    """Fits from the nominal point (or `first`, z by name) and from points drawn from the priors, best first."""
+    if starts < 1:
+        raise HannesError(f"A calibration needs at least one start, not {starts}.")
+    rng = np.random.default_rng(seed)
+    begin = np.array([(first or {}).get(c.name, 0.0) for c in coordinates])
+    found = []
+    for k in range(starts):
+        if announce is not None:
+            announce(k, starts)
+        z = begin if k == 0 else begin + SPREAD * np.clip(rng.standard_normal(len(coordinates)), -1.5, 1.5)
+        found.append(fit(cast(Problem, problem), model, coordinates, z, evaluations=evaluations))
+    return sorted(found, key=lambda f: f.cost)
+
+
+def identify(best: Fit, free: Sequence[str]) -> tuple[Identified, ...]:
+    """Intervals of the free parameters and what the data cannot tell, from the curvature at the best point.
+
+    The covariance of the residual is taken as 1 or, where there are more data than parameters and the misfit is
+    larger than that, inflated to it.
+    """
+    n, k = best.residual.size, len(best.coordinates)
+    inflate = max(1.0, best.misfit / (n - k)) if n > k else 1.0
+    posterior = best.covariance(inflate)
+    information = best.jacobian.T @ best.jacobian
+    # Without priors; a hair of regularisation keeps what is not seen at all finite.
+    alone = np.linalg.pinv(information + 1e-9 * np.eye(k) * max(1.0, float(np.trace(information))))
+    spread = np.sqrt(np.maximum(np.diag(alone), 1e-300))
+    correlation = alone / np.outer(spread, spread)
+    out = []
+    for j, c in enumerate(best.coordinates):
+        if c.name not in free:
+            continue
+        sd = math.sqrt(max(float(posterior[j, j]), 0.0))
+        z = float(best.z[j])
+        low, high = sorted((c.value(z - 1.96 * sd), c.value(z + 1.96 * sd)))
+        others = np.abs(np.where(np.arange(k) == j, 0.0, correlation[j]))
+        other = int(np.argmax(others)) if k > 1 else -1
+        partner = best.coordinates[other].name if other >= 0 and others[other] > CONFOUNDED else None
+        lower, upper = c.bounds
+        bound = bool(min(abs(z - lower), abs(upper - z)) < 1e-3)
+        seen = sd <= UNIDENTIFIED
+        out.append(Identified(c.name, c.unit, c.value(z), low, high, sd, seen and partner is None and not bound, partner,
+                              float(correlation[j, other]) if other >= 0 else 0.0, bound))
+    return tuple(out)
+
+
+def warnings_of(parameters: Sequence[Identified], free_count: int, data_count: int) -> list[str]:
+    """What the user must know of parameters that the data do not identify."""
+    out = []
+    for p in parameters:
+        if p.narrowing > UNIDENTIFIED:
+            out.append(f"{p.name} is not identified by these data: its interval is {100 * p.narrowing:.0f} % of the "
+                       "prior's, which decides much of its value"
+                       + (f" (confounded with {p.confounded})." if p.confounded else "."))
+        elif p.confounded:
+            out.append(f"{p.name} and {p.confounded} cannot be told apart by these data (correlation "
+                       f"{p.correlation:+.3f}); only a combination of both is identified. Fix one of them.")
+        if p.at_bound:
+            out.append(f"{p.name} ends on its bound ({p.value:.4g} {p.unit}); the model may lack something.")
+    if free_count >= data_count:
+        out.append(f"{free_count} free parameters for {data_count} figures: the priors fill in; reaching the figures "
+                   "is a calibration and proves nothing about the model.")
+    return out
+
+
+def calibrated_model(model: Model, parameters: Sequence[Identified], source: str) -> Model:
+    """The model with the identified values, their intervals as bounds' comment in the source, status identified."""
+    values = {p.name: p for p in parameters}
+
+    def entry(p: Parameter, found: Identified) -> Parameter:
+        interval = f"95 % {found.low:.4g} .. {found.high:.4g}"
+        doubt = "" if found.identified else "; not identified alone"
+        return p.at(found.value, status="identified", source=f"{source}; {interval}{doubt}")
+
+    changed = {n: entry(p, values[n]) for n, p in model.parameters.items() if n in values}
+    out = replace(model, parameters=replace(model.parameters, entries={**model.parameters.entries, **changed}, _hash=[]))
+    for e in model.effects:
+        own = {n: entry(p, values[f"{e.name}.{n}"]) if f"{e.name}.{n}" in values else p
+               for n, p in e.parameters.items()}
+        out = out.with_effect(EffectEntry(e.name, own, e.source))
+    return out
+
+
+def calibrate_targets(problem: TargetProblem, model: Model, coordinates: Sequence[Coordinate], *, starts: int = 3,
+                      seed: int = 0, evaluations: int = 15, cache: Path | None = None,
+                      first: Mapping[str, float] | None = None, progress: Progress | None = None) -> Calibration:
+    """Calibrate on published figures."""
+    remembered = Remembered(problem, problem.key, cache, progress)
+    remembered.total = starts * evaluations * (len(coordinates) + 1)
+
+    def announce(k: int, n: int) -> None:
+        remembered.text = f"start {k + 1} of {n}"
+
+    found = search(remembered, model, coordinates, starts=starts, seed=seed, evaluations=evaluations, first=first,
+                   announce=announce)
+    free = [c.name for c in coordinates]
+    parameters = identify(found[0], free)
+    notes = warnings_of(parameters, len(free), len(problem.targets))
+    rows = ", ".join(dict.fromkeys(t.row for t in problem.targets))
+    costs = tuple(f.cost for f in found)
+    return Calibration(calibrated_model(model, parameters, f"fitted to {rows}"), parameters, costs, _agree(costs), {},
+                       tuple(notes), problem.simulations, remembered.hits, found[0])
+
+
+def _agree(costs: Sequence[float]) -> int:
+    return sum(c <= 1.01 * costs[0] + 1e-6 for c in costs)
+
+
+def calibrate(prepared: Prepared, free: Sequence[str], *, sds: Mapping[str, float] | None = None, starts: int = 3,
+              seed: int = 0, evaluations: int = 15, cache: Path | None = None,
+              progress: Progress | None = None) -> Calibration:
+    """Calibrate named parameters on recordings.
+
+    Beside them, what belongs to one recording alone (place and stiffness of its object, zero of its encoder) is fitted
+    with its own prior.  Held-out error: every second closure takes no part in a further fit.
+    Raises HannesError for a name that the plant cannot change.
+    """
+    model, problem = prepared.model, prepared.problem
+    _check_names(prepared, free)
+    coordinates = free_coordinates(model, free, sds)
+    coordinates += [nuisance_coordinate(n) for n in prepared.nuisances if "@" in n.name]
+    used = data_used(prepared.features)
+    whitening = hashlib.sha256(b"".join(np.ascontiguousarray(lower).tobytes() for _, lower in problem.whitener))
+    key = json.dumps([[d["sha256"], d["name"], d["closures"], d["signals"]] for d in used]) + whitening.hexdigest()
+    remembered = Remembered(problem, key, cache, progress)
+    remembered.total = starts * evaluations * (len(coordinates) + 1)
+
+    def announce(k: int, n: int) -> None:
+        remembered.text = f"start {k + 1} of {n}"
+
+    found = search(remembered, model, coordinates, starts=starts, seed=seed, evaluations=evaluations, announce=announce)
+    best = found[0]
+    parameters = identify(best, free)
+    features = prepared.features
+    before = overall(signal_errors(features, features.closures(prepared.rig, model, {})))
+    after = overall(signal_errors(features, features.closures(prepared.rig, model, best.values)))
+    errors = {"before": before, "after": after}
+    if any(b.n > 1 for b in features.blocks):
+        if progress is not None:
+            progress(remembered.done, max(remembered.total, remembered.done), "held-out closures")
+
+        def problem_of(train: Any) -> Any:
+            return build_problem(prepared.rig, train, model, prepared.nuisances, best.values)
+
+        errors["train"], errors["held_out"] = held_out_closures(problem_of, features, model, coordinates, best.z)
+    bags = ", ".join(str(d["name"]) for d in used)
+    made = calibrated_model(model, parameters, f"calibrated on {bags}")
+    made = replace(made, provenance={
+        **dict(model.provenance),
+        "bags": [{"source": d["source"], "sha256": d["sha256"], "closures": d["closures"]} for d in used],
+        "nominal_sha256": model.sha256, "free": list(free),
+        "error_unit": "multiples of the repeatability between closures",
+        "errors": {k: round(v, 4) for k, v in errors.items()},
+        "recordings": {n: float(f"{v:.6g}") for n, v in best.values.items() if "@" in n}})
+    notes = warnings_of(parameters, len(free), features.size)
+    costs = tuple(f.cost for f in found)
+    if starts > 1 and _agree(costs) == 1:
+        notes.append("Only one start reached the best point; try more --starts.")
+    return Calibration(made, parameters, costs, _agree(costs), errors, (*notes, *prepared.notes), problem.simulations,
+                       remembered.hits, best)
+
+
+def _check_names(prepared: Prepared, free: Sequence[str]) -> None:
+    if not isinstance(prepared.rig, HandRig):
+        return
+    settable: set[str] = set()
+    for trial in prepared.rig.trials:
+        plant, _, _ = prepared.rig._plant(prepared.model, trial)
+        settable |= set(plant.names)
+    unknown = [n for n in free if n not in settable or n.startswith("object.")]
+    if unknown:
+        valid = sorted(n for n in settable if not n.startswith(("object.", "geometry.", "inertia.")))
+        raise HannesError(f"--free {', '.join(unknown)}: not a parameter that the plant '{prepared.model.plant}' can "
+                          f"change; valid are {', '.join(valid)}.")
