@@ -54,6 +54,7 @@ class Emps(PlantRig):
     sizes = {"N.m": 40.0, "rad": 0.246, "V": 10.0, "A": 10.0}  # N, m, V; the command counts as the current
     floor = 1e-5  # the reference is known exactly
     points = 320
+    pooled = True
     drive_signals = ("drive_force",)
     phases = {"void": "forward", "opening": "back"}
     without = {

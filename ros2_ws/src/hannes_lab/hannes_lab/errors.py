@@ -78,6 +78,17 @@ def overall(errors: Sequence[SignalError]) -> float:
     return float(np.sqrt((ratios**2).mean())) if ratios.size else float("nan")
 
 
+def pooled_repeatability(features: Features) -> dict[str, float]:
+    """Repeatability of each signal over all conditions, weighted by their duration, in its unit; 0 if unknown."""
+    out: dict[str, float] = {}
+    for signal in dict.fromkeys(b.signal for b in features.blocks):
+        own = [b for b in features.blocks if b.signal == signal and b.n > 1]
+        seconds = np.array([b.phase[-1] - b.phase[0] for b in own])
+        power = np.array([repeatability(b) ** 2 for b in own])
+        out[signal] = float(np.sqrt(seconds @ power / seconds.sum())) if own else 0.0
+    return out
+
+
 def per_signal(features: Features, errors: Iterable[Sequence[SignalError]]) -> dict[str, float]:
     """Root mean square error of each signal over the conditions, weighted by their duration, in the signal's unit."""
     duration = {(b.condition, b.signal): float(b.phase[-1] - b.phase[0]) for b in features.blocks}

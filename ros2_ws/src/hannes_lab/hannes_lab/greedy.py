@@ -12,11 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .errors import held_out_conditions
+from .errors import held_out_condition_errors, per_signal, pooled_repeatability
 from .search import Candidate, Search
 
 JUDGED = 3
 """Candidates of each round (the best fits) whose error on held-out conditions is found."""
+
+POLISH_STEPS = 40
+"""Limit on the steps of the last fit of each of them: valleys of friction laws are long."""
 
 ALIKE = 0.02
 """Candidates whose held-out error is this close to the best, as a part of it, tie with it."""
@@ -40,14 +43,21 @@ class Grown:
 
 
 def held_out_error(search: Search, candidate: Candidate) -> float:
-    """Root mean square over conditions of the error on each when it took no part in the fit.
+    """Error on conditions that took no part in the fit, root mean square, in multiples of the repeatability.
+
+    Errors of a signal are averaged over the conditions first, in its unit: a condition that happens to repeat well does
+    not count more.
 
     The derivatives of the fit to all conditions serve for all refits: leaving one out moves the optimum little.
     """
     fit = candidate.fit
     known = {c.name: fit.jacobian[:, j] for j, c in enumerate(fit.coordinates)}
-    errors = held_out_conditions(search.problem, fit.model, fit.coordinates, fit.z, known=known)
-    return float(np.sqrt(np.mean([e**2 for e in errors.values()]))) if errors else float("nan")
+    features = search.problem.features
+    errors = held_out_condition_errors(search.problem, fit.model, fit.coordinates, fit.z, known=known)
+    error = per_signal(features, errors.values())
+    repeats = pooled_repeatability(features)
+    ratios = [error[s] / repeats[s] for s in error if repeats[s] > 0.0]
+    return float(np.sqrt(np.mean(np.square(ratios)))) if ratios else float("nan")
 
 
 def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grown:
@@ -57,33 +67,62 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
     errors = [held_out_error(search, null)]
     rivals: tuple[Candidate, ...] = ()
     notes: list[str] = []
-    for size in range(1, max_effects + 1):
-        round_ = search.extend([best], list(search.sources), f"effect {size}")
-        if not round_:
+    while len(best.names) < max_effects:
+        text = f"effect {len(best.names) + 1}"
+        singles = search.extend([best], list(search.sources), text)
+        if not singles:
             break
-        first = first or tuple(round_)
-        judged = round_[:JUDGED]
-        held = search.each(_held_in_worker, [(c,) for c in judged], f"effect {size}: held-out conditions")
-        order = np.argsort(held)
-        winner = int(order[0])
-        name = judged[winner].names[-1]
-        if not held[winner] <= (1.0 - gain) * errors[-1]:
+        first = first or tuple(singles)
+        found = _judge(search, singles, text)
+        enough = 1.0 - gain
+        if not found.error <= enough * errors[-1] and len(best.names) + 2 <= max_effects:
+            # Two effects may be worth it of which neither is alone.
+            pairs = search.extend(singles[:JUDGED], list(search.sources), f"{text}, as a pair")
+            two = _judge(search, pairs, text) if pairs else found
+            if two.error <= enough**2 * errors[-1]:
+                found, enough = two, enough**2
+        if not found.error <= enough * errors[-1]:
             notes.append(
-                f"the next effect, {name}, would lower the held-out error from {errors[-1]:.2f} to "
-                f"{held[winner]:.2f}, which is less than {100 * gain:.0f} %: the search stops here"
+                f"the next effect, {found.best.names[-1]}, would change the held-out error from {errors[-1]:.2f} to "
+                f"{found.error:.2f}; a fall of {100 * gain:.0f} % is asked for: the search stops here"
             )
             break
         if rivals:
             notes.append(_close_call(best, rivals))
-        best = judged[winner]
-        errors.append(float(held[winner]))
-        rivals = tuple(judged[int(k)] for k in order[1:] if held[int(k)] <= (1.0 + ALIKE) * held[winner])
+        best, rivals = found.best, found.rivals
+        errors.append(found.error)
     return Grown(best, first, tuple(errors), rivals, tuple(notes))
 
 
+@dataclass(frozen=True)
+class _Judged:
+    best: Candidate
+    error: float
+    rivals: tuple[Candidate, ...]
+
+
+def _judge(search: Search, candidates: Sequence[Candidate], text: str) -> _Judged:
+    """The best of the best fits by held-out error; of those that are alike, the one with the fewest parameters."""
+    judged = search.each(_polish_in_worker, [(c,) for c in candidates[:JUDGED]], f"{text}: polish")
+    held = search.each(_held_in_worker, [(c,) for c in judged], f"{text}: held-out conditions")
+    least = min(held)
+    alike = [k for k in range(len(judged)) if held[k] <= (1.0 + ALIKE) * least]
+    if not alike:
+        return _Judged(judged[0], float("nan"), ())
+    for candidate in judged:
+        search.found[tuple(sorted(candidate.names))] = candidate
+    winner = min(alike, key=lambda k: (len(judged[k].fit.coordinates), held[k]))
+    rivals = tuple(judged[k] for k in sorted(alike, key=lambda k: held[k]) if k != winner)
+    return _Judged(judged[winner], float(held[winner]), rivals)
+
+
 def _close_call(best: Candidate, rivals: Sequence[Candidate]) -> str:
-    names = " or ".join(c.names[-1] for c in rivals)
+    names = " or ".join(" + ".join(n for n in c.names if n not in best.names) for c in rivals)
     return f"when {best.names[-1]} joined, {names} would have been as good within {100 * ALIKE:.0f} %"
+
+
+def _polish_in_worker(search: Search, candidate: Candidate) -> Candidate:
+    return search.polish(candidate, evaluations=POLISH_STEPS)
 
 
 def _held_in_worker(search: Search, candidate: Candidate) -> float:

@@ -80,9 +80,11 @@ def effect_coordinates(effect: EffectType) -> list[Coordinate]:
     out = []
     for p in effect.parameters:
         if p.vanishing is None and p.lower > 0.0:
+            # The last of many waves moves far when the period changes a little.
+            step = 1e-4 if p.period else 0.03
             out.append(
                 Coordinate(
-                    f"{effect.name}.{p.name}", p.typical, 1.0, True, p.lower, p.upper, False, 0.03, p.unit
+                    f"{effect.name}.{p.name}", p.typical, 1.0, True, p.lower, p.upper, False, step, p.unit
                 )
             )
         else:
@@ -164,8 +166,10 @@ def build_problem(
         span = float(np.ptp(block.measured)) or 1.0
         floor = (rig.floor * span) ** 2
         variances.append(_sample_variance(block.measured, e) + floor)
+    if rig.pooled:
+        variances = _pooled(features, variances)
     columns: list[list[Array]] = []
-    scatter_names = [n for n in nuisances if n.closure_sd > 0.0]
+    scatter_names = [n for n in nuisances if n.closure_sd > 0.0 and not rig.pooled]
     for nuisance in scatter_names:
         c = nuisance_coordinate(nuisance)
         here = c.z(values.get(nuisance.name, nuisance.mean))
@@ -196,6 +200,18 @@ def build_problem(
             if rows.size:
                 whitener.append((rows, np.linalg.cholesky(single / count)))
     return Problem(rig, features, tuple(whitener), tuple(deviations))
+
+
+def _pooled(features: Features, variances: Sequence[Array]) -> list[Array]:
+    """The same variance for all samples of a signal; where phases lie closer together, a sample counts less."""
+    steps = [float(block.phase[1] - block.phase[0]) for block in features.blocks]
+    out = []
+    for block, v, step in zip(features.blocks, variances, steps, strict=True):
+        own = [k for k, other in enumerate(features.blocks) if other.signal == block.signal]
+        seconds = np.array([steps[k] * variances[k].size for k in own])
+        mean = float(seconds @ [variances[k].mean() for k in own] / seconds.sum())
+        out.append(np.full(v.size, mean * float(np.mean([steps[k] for k in own])) / step))
+    return out
 
 
 def _parts(features: Features, own: Sequence[int], n: int) -> list[tuple[list[tuple[int, int, int]], float]]:

@@ -72,12 +72,15 @@ class Rig(Protocol):
     points    points of the phase grid of one closure at most
     without   effects that have no meaning on this machine, with the reason
     drive_signals  signals that tell force or torque of the drive
+    pooled    True: in a fit every sample of a signal counts the same, and the fit is of least square error.  For
+              machines that repeat far better than any model will fit; the exact moments would rule the fit otherwise
     """
 
     trials: tuple[Trial, ...]
     floor: float
     points: int
     drive_signals: tuple[str, ...]
+    pooled: bool
     without: Mapping[str, str]
 
     def nuisances(self, model: Model) -> Sequence[Nuisance]:
@@ -109,7 +112,7 @@ class PlantRig:
                  from REFERENCE_SIZES; effects are scaled by them
     linear       True where position is in m and the drive gives N: units are named so
     without      effects that have no meaning here, with the reason
-    floor, points, drive_signals  see Rig
+    floor, points, drive_signals, pooled  see Rig
     phases       other names for the phases void, grasp, hold, opening, rest
     figures      True where the figures of a hand's closure (closing time, grip force ...) have a meaning
 
@@ -124,6 +127,7 @@ class PlantRig:
     floor: float = 2e-4  # replay of a reference logged by messages, and a plant of finite step
     points: int = 160
     drive_signals: tuple[str, ...] = ("motor_current", "motor_effort")
+    pooled: bool = False
     phases: ClassVar[Mapping[str, str]] = {}
     figures: ClassVar[bool] = False
     source: ClassVar[str] = ""

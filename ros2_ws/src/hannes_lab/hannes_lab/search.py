@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from .problem import (
     vanishing_entry,
 )
 from .rig import Nuisance
+from .surrogate import AnchoredRig, anchored_at
 from .spectrum import position_periods
 
 Array = NDArray[np.float64]
@@ -54,6 +55,10 @@ REFIT = 8
 
 POLISH = 3
 """Extensions of a round that are refitted with all derivatives afresh."""
+
+MOVES = 4
+SETTLED = 0.1
+"""The anchor of a slow plant moves at most so often, or until no coordinate moves by more than this."""
 
 PENALTY = 4.0
 """Cost of one parameter (Akaike's 2 doubled, since shape parameters are searched over several starts)."""
@@ -91,7 +96,9 @@ class Search:
     def null(self) -> Candidate:
         """The model as it is, with its nuisance parameters fitted."""
         if () not in self.found:
-            best = fit(self.problem, self.model, self.coordinates, {}, rows=self.rows, evaluations=25)
+            best = self._settle(
+                fit(self.problem, self.model, self.coordinates, {}, rows=self.rows, evaluations=25)
+            )
             self.found[()] = Candidate((), best, best.cost)
         return self.found[()]
 
@@ -128,6 +135,8 @@ class Search:
         for shape in itertools.product(*shapes):
             for group in strengths:
                 trials += [(dict((*shape, one)), one) for one in group]
+        # The amplitudes of one wave, or the halves of a difference, are right together only.
+        joint = list(itertools.product(*shapes)) if len(strengths) > 1 else []
         scored: list[list[tuple[float, dict[str, float]]]] = []
         for point in (base, self.prior_point(base)):
             here = {c.name: float(z) for c, z in zip(point.coordinates, point.z, strict=True)}
@@ -156,8 +165,36 @@ class Search:
                         follow.append((cost, {**start, strength: best}))
             for _, start in sorted(follow, key=lambda item: item[0])[:FOLLOW]:
                 scores.append(score(start, at(start)))
+            for shape in joint:
+                start = self._joint_start(point, dict(shape), own, model, coordinates)
+                scores.append(score(start, at(start)))
             scored.append(sorted(scores, key=lambda item: item[0])[:keep])
         return sorted((one for scores in scored for one in scores), key=lambda item: item[0])
+
+    def _joint_start(
+        self,
+        base: Fit,
+        shape: Mapping[str, float],
+        own: Mapping[str, Coordinate],
+        model: Model,
+        coordinates: Sequence[Coordinate],
+    ) -> dict[str, float]:
+        """All strengths of an effect by one Gauss-Newton step from nought, together with the base's coordinates."""
+        use = slice(None) if self.rows is None else self.rows
+        strengths = [k for k, c in enumerate(coordinates) if c.name in own and c.name not in shape]
+        here = {c.name: float(z) for c, z in zip(base.coordinates, base.z, strict=True)}
+        z = np.array([{**here, **shape}.get(c.name, 0.0) for c in coordinates])
+        added = finite_differences(self.problem, model, coordinates, z, base.residual, strengths)
+        prior = np.array([1.0 if c.prior else 0.0 for c in base.coordinates] + [0.0] * len(strengths))
+        pull = np.concatenate([base.z, np.zeros(len(strengths))])
+        a = np.vstack([np.column_stack([base.jacobian[use], added[use]]), np.diag(prior)])
+        target = np.concatenate([base.residual[use], prior * pull])
+        step = -np.linalg.lstsq(a, target, rcond=None)[0]
+        out = dict(shape)
+        for k, s in zip(strengths, step[base.z.size :], strict=True):
+            low, high = coordinates[k].bounds
+            out[coordinates[k].name] = float(np.clip(s, low, high))
+        return out
 
     def followed(self, derivative: Array, base: Fit) -> tuple[float, float]:
         """Least cost along one more direction, with the base fit's coordinates compensating, and how far along it."""
@@ -195,7 +232,13 @@ class Search:
         r = residual[use]
         step = -np.linalg.solve(a, jacobian.T @ r + prior * base.z)
         moved, z = r + jacobian @ step, base.z + step
-        return float(moved @ moved + (prior * z) @ (prior * z)), np.clip(z, -8.0, 8.0)
+        return float(moved @ moved + (prior * z) @ (prior * z)), self._inside(z, base)
+
+    @staticmethod
+    def _inside(z: Array, base: Fit) -> Array:
+        """Nuisance parameters within eight standard deviations, the others within their bounds."""
+        bounds = np.array([(-8.0, 8.0) if c.prior else c.bounds for c in base.coordinates]).reshape(-1, 2)
+        return np.asarray(np.clip(z, bounds[:, 0], bounds[:, 1]), dtype=np.float64)
 
     def add(
         self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None = None
@@ -206,10 +249,35 @@ class Search:
         if starts is None:
             starts = [start for _, start in self.starts(name, base.fit, model, coordinates, KEEP)]
         tried = [
-            fit(self.problem, model, coordinates, start, rows=self.rows, known=known, evaluations=10)
+            fit(
+                self.problem,
+                model,
+                coordinates,
+                self._true_start(base.fit, model, coordinates, start),
+                rows=self.rows,
+                known=known,
+                evaluations=10,
+            )
             for start in starts
         ]
         return self._keep(base, name, min(tried, key=lambda f: f.cost))
+
+    def _true_start(
+        self, base: Fit, model: Model, coordinates: Sequence[Coordinate], start: Mapping[str, float]
+    ) -> Mapping[str, float]:
+        """The start as the scan gave it, or with the base left where it is: whichever costs less in closed loop.
+
+        The scan moves the base linearly; where effects of the base are far from linear, that leads astray.
+        """
+        if not any(not c.prior for c in base.coordinates):
+            return start
+        kept = {**start, **{c.name: float(z) for c, z in zip(base.coordinates, base.z, strict=True)}}
+        use = slice(None) if self.rows is None else self.rows
+        costs = []
+        for one in (start, kept):
+            r = self.problem.residual(model, {c.name: c.value(one.get(c.name, 0.0)) for c in coordinates})[use]
+            costs.append(float(r @ r) + sum(one.get(c.name, 0.0) ** 2 for c in coordinates if c.prior))
+        return start if costs[0] <= costs[1] else kept
 
     def _keep(self, base: Candidate, name: str, best: Fit) -> Candidate:
         free = sum(1 for c in best.coordinates if not c.prior)
@@ -220,24 +288,41 @@ class Search:
     def polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
         """Refit from the candidate's point with all derivatives taken afresh."""
         old = candidate.fit
-        new = fit(self.problem, old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
+        new = self._settle(
+            fit(self.problem, old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
+        )
         if new.cost < old.cost:
             candidate = Candidate(candidate.names, new, candidate.penalised - old.cost + new.cost)
             self.found[tuple(sorted(candidate.names))] = candidate
         return candidate
 
+    def _settle(self, found: Fit) -> Fit:
+        """A fit on a slow plant seen through a fast one, with the anchor moved to where the fit ends, until it stays."""
+        if not isinstance(self.problem.rig, AnchoredRig):
+            return found
+        for _ in range(MOVES):
+            problem = replace(self.problem, rig=anchored_at(self.problem.rig, found.model, found.values))
+            again = fit(problem, found.model, found.coordinates, found.z, rows=self.rows, evaluations=8)
+            moved = float(np.max(np.abs(again.z - found.z), initial=0.0))
+            self.problem.simulations, self.problem.failures = problem.simulations, problem.failures
+            found = again
+            if moved < SETTLED:
+                break
+        return found
+
     def renewed(self, best: Candidate) -> Search:
         """The same search with noise and scatter estimated at another point: sensitivities there are the true ones."""
-        problem = build_problem(
-            self.problem.rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values
-        )
+        rig = anchored_at(self.problem.rig, best.fit.model, best.fit.values)
+        problem = build_problem(rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values)
         problem.simulations, problem.failures = self.problem.simulations, self.problem.failures
         return Search(problem, self.model, self.nuisances, self.sources, self.jobs, self.progress, self.rows)
 
     def refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
         """A candidate of another problem (other noise), fitted in this one from its point."""
         old = candidate.fit
-        new = fit(self.problem, old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
+        new = self._settle(
+            fit(self.problem, old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
+        )
         free = sum(1 for c in new.coordinates if not c.prior)
         out = Candidate(candidate.names, new, new.cost + PENALTY * free)
         self.found[tuple(sorted(out.names))] = out
