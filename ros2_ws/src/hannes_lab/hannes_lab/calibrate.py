@@ -1,7 +1,7 @@
 """Calibration: named parameters of a model identified from recordings, or from published figures.
 
-    z* = argmin |r(z)|^2 + |z|^2        r: whitened residual (Problem, or TargetProblem); z: standard deviations from the
-                                        prior's mean, inside the bounds
+    z* = argmin |r(z)|^2 + |z|^2        r: whitened residual (Problem or TargetProblem); z: standard deviations
+                                        from the prior's mean, inside the bounds
 
 from several starts; intervals from the curvature at the best.  A parameter whose posterior is hardly narrower than its
 prior is not identified by the data; of two whose effects on the data are nearly proportional only one combination is.
@@ -18,9 +18,10 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Annotated, Any, Protocol, cast
 
 import numpy as np
+import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import EffectEntry, Model
 from hannes_description.parameters import Parameter, data_path, read_yaml
@@ -77,7 +78,9 @@ class Target:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.value) and math.isfinite(self.sd) and self.sd > 0.0):
-            raise HannesError(f"Target '{self.name}': value {self.value} and sd {self.sd} must be finite, sd positive.")
+            raise HannesError(
+                f"Target '{self.name}': value {self.value} and sd {self.sd} must be finite, sd positive."
+            )
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,9 @@ class Remembered:
             try:
                 folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
-                raise HannesError(f"Cannot use the cache folder '{folder}': {error}; give another --cache.") from error
+                raise HannesError(
+                    f"Cannot use the cache folder '{folder}': {error}; give another --cache."
+                ) from error
 
     @property
     def features(self) -> Any:
@@ -211,13 +216,21 @@ class Calibration:
     best: Fit = field(repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        return {"model": {"name": self.model.name, "sha256": self.model.sha256},
-                "parameters": [p.to_dict() for p in self.parameters], "costs": list(self.costs), "agree": self.agree,
-                "errors": dict(self.errors), "warnings": list(self.warnings), "simulations": self.simulations,
-                "from_cache": self.from_cache}
+        return {
+            "model": {"name": self.model.name, "sha256": self.model.sha256},
+            "parameters": [p.to_dict() for p in self.parameters],
+            "costs": list(self.costs),
+            "agree": self.agree,
+            "errors": dict(self.errors),
+            "warnings": list(self.warnings),
+            "simulations": self.simulations,
+            "from_cache": self.from_cache,
+        }
 
 
-def free_coordinates(model: Model, names: Sequence[str], sds: Mapping[str, float] | None = None) -> list[Coordinate]:
+def free_coordinates(
+    model: Model, names: Sequence[str], sds: Mapping[str, float] | None = None
+) -> list[Coordinate]:
     """Coordinates of named parameters of a model or of its effects, with bounds and priors.
 
     sds  prior standard deviation by name: of the logarithm for positive parameters, else in the parameter's unit
@@ -237,17 +250,40 @@ def free_coordinates(model: Model, names: Sequence[str], sds: Mapping[str, float
         sd = (sds or {}).get(name)
         if sd is None:
             known = table.get(name)
-            sd = WIDEN * float(known["hand_sd"]) if known and log else DEFAULT_SD * (1.0 if log else p.upper - p.lower)
+            sd = (
+                WIDEN * float(known["hand_sd"])
+                if known and log
+                else DEFAULT_SD * (1.0 if log else p.upper - p.lower)
+            )
         if not (math.isfinite(sd) and sd > 0.0):
             raise HannesError(f"The prior of '{name}' has the standard deviation {sd}; it must be positive.")
-        out.append(Coordinate(name, p.value, sd, log, max(p.lower, 1e-3 * p.value) if log else p.lower, p.upper, True,
-                              STEP / sd if log else STEP, p.unit))
+        out.append(
+            Coordinate(
+                name,
+                p.value,
+                sd,
+                log,
+                max(p.lower, 1e-3 * p.value) if log else p.lower,
+                p.upper,
+                True,
+                STEP / sd if log else STEP,
+                p.unit,
+            )
+        )
     return out
 
 
-def search(problem: Residuals, model: Model, coordinates: Sequence[Coordinate], *, starts: int = 3, seed: int = 0,
-           evaluations: int = 15, first: Mapping[str, float] | None = None,
-           announce: Callable[[int, int], None] | None = None) -> list[Fit]:
+def search(
+    problem: Residuals,
+    model: Model,
+    coordinates: Sequence[Coordinate],
+    *,
+    starts: int = 3,
+    seed: int = 0,
+    evaluations: int = 15,
+    first: Mapping[str, float] | None = None,
+    announce: Callable[[int, int], None] | None = None,
+) -> list[Fit]:
     """Fits from the nominal point (or `first`, z by name) and from points drawn from the priors, best first."""
     if starts < 1:
         raise HannesError(f"A calibration needs at least one start, not {starts}.")
@@ -289,8 +325,20 @@ def identify(best: Fit, free: Sequence[str]) -> tuple[Identified, ...]:
         lower, upper = c.bounds
         bound = bool(min(abs(z - lower), abs(upper - z)) < 1e-3)
         seen = sd <= UNIDENTIFIED
-        out.append(Identified(c.name, c.unit, c.value(z), low, high, sd, seen and partner is None and not bound, partner,
-                              float(correlation[j, other]) if other >= 0 else 0.0, bound))
+        out.append(
+            Identified(
+                c.name,
+                c.unit,
+                c.value(z),
+                low,
+                high,
+                sd,
+                seen and partner is None and not bound,
+                partner,
+                float(correlation[j, other]) if other >= 0 else 0.0,
+                bound,
+            )
+        )
     return tuple(out)
 
 
@@ -299,17 +347,23 @@ def warnings_of(parameters: Sequence[Identified], free_count: int, data_count: i
     out = []
     for p in parameters:
         if p.narrowing > UNIDENTIFIED:
-            out.append(f"{p.name} is not identified by these data: its interval is {100 * p.narrowing:.0f} % of the "
-                       "prior's, which decides much of its value"
-                       + (f" (confounded with {p.confounded})." if p.confounded else "."))
+            out.append(
+                f"{p.name} is not identified by these data: its interval is {100 * p.narrowing:.0f} % of the "
+                "prior's, which decides much of its value"
+                + (f" (confounded with {p.confounded})." if p.confounded else ".")
+            )
         elif p.confounded:
-            out.append(f"{p.name} and {p.confounded} cannot be told apart by these data (correlation "
-                       f"{p.correlation:+.3f}); only a combination of both is identified. Fix one of them.")
+            out.append(
+                f"{p.name} and {p.confounded} cannot be told apart by these data (correlation "
+                f"{p.correlation:+.3f}); only a combination of both is identified. Fix one of them."
+            )
         if p.at_bound:
             out.append(f"{p.name} ends on its bound ({p.value:.4g} {p.unit}); the model may lack something.")
     if free_count >= data_count:
-        out.append(f"{free_count} free parameters for {data_count} figures: the priors fill in; reaching the figures "
-                   "is a calibration and proves nothing about the model.")
+        out.append(
+            f"{free_count} free parameters for {data_count} figures: the priors fill in; reaching the figures "
+            "is a calibration and proves nothing about the model."
+        )
     return out
 
 
@@ -323,17 +377,30 @@ def calibrated_model(model: Model, parameters: Sequence[Identified], source: str
         return p.at(found.value, status="identified", source=f"{source}; {interval}{doubt}")
 
     changed = {n: entry(p, values[n]) for n, p in model.parameters.items() if n in values}
-    out = replace(model, parameters=replace(model.parameters, entries={**model.parameters.entries, **changed}, _hash=[]))
+    out = replace(
+        model, parameters=replace(model.parameters, entries={**model.parameters.entries, **changed}, _hash=[])
+    )
     for e in model.effects:
-        own = {n: entry(p, values[f"{e.name}.{n}"]) if f"{e.name}.{n}" in values else p
-               for n, p in e.parameters.items()}
+        own = {
+            n: entry(p, values[f"{e.name}.{n}"]) if f"{e.name}.{n}" in values else p
+            for n, p in e.parameters.items()
+        }
         out = out.with_effect(EffectEntry(e.name, own, e.source))
     return out
 
 
-def calibrate_targets(problem: TargetProblem, model: Model, coordinates: Sequence[Coordinate], *, starts: int = 3,
-                      seed: int = 0, evaluations: int = 15, cache: Path | None = None,
-                      first: Mapping[str, float] | None = None, progress: Progress | None = None) -> Calibration:
+def calibrate_targets(
+    problem: TargetProblem,
+    model: Model,
+    coordinates: Sequence[Coordinate],
+    *,
+    starts: int = 3,
+    seed: int = 0,
+    evaluations: int = 15,
+    cache: Path | None = None,
+    first: Mapping[str, float] | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
     """Calibrate on published figures."""
     remembered = Remembered(problem, problem.key, cache, progress)
     remembered.total = starts * evaluations * (len(coordinates) + 1)
@@ -341,24 +408,49 @@ def calibrate_targets(problem: TargetProblem, model: Model, coordinates: Sequenc
     def announce(k: int, n: int) -> None:
         remembered.text = f"start {k + 1} of {n}"
 
-    found = search(remembered, model, coordinates, starts=starts, seed=seed, evaluations=evaluations, first=first,
-                   announce=announce)
+    found = search(
+        remembered,
+        model,
+        coordinates,
+        starts=starts,
+        seed=seed,
+        evaluations=evaluations,
+        first=first,
+        announce=announce,
+    )
     free = [c.name for c in coordinates]
     parameters = identify(found[0], free)
     notes = warnings_of(parameters, len(free), len(problem.targets))
     rows = ", ".join(dict.fromkeys(t.row for t in problem.targets))
     costs = tuple(f.cost for f in found)
-    return Calibration(calibrated_model(model, parameters, f"fitted to {rows}"), parameters, costs, _agree(costs), {},
-                       tuple(notes), problem.simulations, remembered.hits, found[0])
+    return Calibration(
+        calibrated_model(model, parameters, f"fitted to {rows}"),
+        parameters,
+        costs,
+        _agree(costs),
+        {},
+        tuple(notes),
+        problem.simulations,
+        remembered.hits,
+        found[0],
+    )
 
 
 def _agree(costs: Sequence[float]) -> int:
     return sum(c <= 1.01 * costs[0] + 1e-6 for c in costs)
 
 
-def calibrate(prepared: Prepared, free: Sequence[str], *, sds: Mapping[str, float] | None = None, starts: int = 3,
-              seed: int = 0, evaluations: int = 15, cache: Path | None = None,
-              progress: Progress | None = None) -> Calibration:
+def calibrate(
+    prepared: Prepared,
+    free: Sequence[str],
+    *,
+    sds: Mapping[str, float] | None = None,
+    starts: int = 3,
+    seed: int = 0,
+    evaluations: int = 15,
+    cache: Path | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
     """Calibrate named parameters on recordings.
 
     Beside them, what belongs to one recording alone (place and stiffness of its object, zero of its encoder) is fitted
@@ -370,15 +462,22 @@ def calibrate(prepared: Prepared, free: Sequence[str], *, sds: Mapping[str, floa
     coordinates = free_coordinates(model, free, sds)
     coordinates += [nuisance_coordinate(n) for n in prepared.nuisances if "@" in n.name]
     used = data_used(prepared.features)
-    whitening = hashlib.sha256(b"".join(np.ascontiguousarray(lower).tobytes() for _, lower in problem.whitener))
-    key = json.dumps([[d["sha256"], d["name"], d["closures"], d["signals"]] for d in used]) + whitening.hexdigest()
+    whitening = hashlib.sha256(
+        b"".join(np.ascontiguousarray(lower).tobytes() for _, lower in problem.whitener)
+    )
+    key = (
+        json.dumps([[d["sha256"], d["name"], d["closures"], d["signals"]] for d in used])
+        + whitening.hexdigest()
+    )
     remembered = Remembered(problem, key, cache, progress)
     remembered.total = starts * evaluations * (len(coordinates) + 1)
 
     def announce(k: int, n: int) -> None:
         remembered.text = f"start {k + 1} of {n}"
 
-    found = search(remembered, model, coordinates, starts=starts, seed=seed, evaluations=evaluations, announce=announce)
+    found = search(
+        remembered, model, coordinates, starts=starts, seed=seed, evaluations=evaluations, announce=announce
+    )
     best = found[0]
     parameters = identify(best, free)
     features = prepared.features
@@ -392,22 +491,38 @@ def calibrate(prepared: Prepared, free: Sequence[str], *, sds: Mapping[str, floa
         def problem_of(train: Any) -> Any:
             return build_problem(prepared.rig, train, model, prepared.nuisances, best.values)
 
-        errors["train"], errors["held_out"] = held_out_closures(problem_of, features, model, coordinates, best.z)
+        errors["train"], errors["held_out"] = held_out_closures(
+            problem_of, features, model, coordinates, best.z
+        )
     bags = ", ".join(str(d["name"]) for d in used)
     made = calibrated_model(model, parameters, f"calibrated on {bags}")
-    made = replace(made, provenance={
-        **dict(model.provenance),
-        "bags": [{"source": d["source"], "sha256": d["sha256"], "closures": d["closures"]} for d in used],
-        "nominal_sha256": model.sha256, "free": list(free),
-        "error_unit": "multiples of the repeatability between closures",
-        "errors": {k: round(v, 4) for k, v in errors.items()},
-        "recordings": {n: float(f"{v:.6g}") for n, v in best.values.items() if "@" in n}})
+    made = replace(
+        made,
+        provenance={
+            **dict(model.provenance),
+            "bags": [{"source": d["source"], "sha256": d["sha256"], "closures": d["closures"]} for d in used],
+            "nominal_sha256": model.sha256,
+            "free": list(free),
+            "error_unit": "multiples of the repeatability between closures",
+            "errors": {k: round(v, 4) for k, v in errors.items()},
+            "recordings": {n: float(f"{v:.6g}") for n, v in best.values.items() if "@" in n},
+        },
+    )
     notes = warnings_of(parameters, len(free), features.size)
     costs = tuple(f.cost for f in found)
     if starts > 1 and _agree(costs) == 1:
         notes.append("Only one start reached the best point; try more --starts.")
-    return Calibration(made, parameters, costs, _agree(costs), errors, (*notes, *prepared.notes), problem.simulations,
-                       remembered.hits, best)
+    return Calibration(
+        made,
+        parameters,
+        costs,
+        _agree(costs),
+        errors,
+        (*notes, *prepared.notes),
+        problem.simulations,
+        remembered.hits,
+        best,
+    )
 
 
 def _check_names(prepared: Prepared, free: Sequence[str]) -> None:
@@ -420,5 +535,78 @@ def _check_names(prepared: Prepared, free: Sequence[str]) -> None:
     unknown = [n for n in free if n not in settable or n.startswith("object.")]
     if unknown:
         valid = sorted(n for n in settable if not n.startswith(("object.", "geometry.", "inertia.")))
-        raise HannesError(f"--free {', '.join(unknown)}: not a parameter that the plant '{prepared.model.plant}' can "
-                          f"change; valid are {', '.join(valid)}.")
+        raise HannesError(
+            f"--free {', '.join(unknown)}: not a parameter that the plant '{prepared.model.plant}' can "
+            f"change; valid are {', '.join(valid)}."
+        )
+
+
+def command(
+    bags: Annotated[list[Path], typer.Argument(help="Bags, or folders of bags, of your hand.")],
+    free: Annotated[str, typer.Option("--free", help="Names of the free parameters, with commas between.")],
+    out: Annotated[Path, typer.Option("--out", help="Model file to write.")] = Path("my_hand.yaml"),
+    model: Annotated[
+        str, typer.Option("--model", help="Model file, or the name of a shipped model.")
+    ] = "nominal",
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--prior", help="NAME=SD: prior standard deviation, of the logarithm for positive parameters."
+        ),
+    ] = None,
+    starts: Annotated[int, typer.Option(min=1, help="Searches from different points.")] = 3,
+    seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,
+    cache: Annotated[
+        Path | None,
+        typer.Option("--cache", help="Folder of finished simulations; a stopped run goes on from it."),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
+) -> None:
+    """Identify named parameters of your hand from recorded closures, with intervals and warnings."""
+    from .cli import _command, _console, _number, _prepared, _print_json, _Progress
+
+    names = [n.strip() for n in free.split(",") if n.strip()]
+    sds = {}
+    for text in prior or ():
+        name, _, value = text.partition("=")
+        try:
+            sds[name] = float(value)
+        except ValueError:
+            raise HannesError(f"--prior {text}: give NAME=SD with a number.") from None
+        if name not in names:
+            raise HannesError(f"--prior {text}: '{name}' is not among --free.")
+    with _Progress(quiet=json) as progress:
+        progress(0, 1, "reading the bags")
+        prepared = _prepared(bags, model, None, None)
+        found = calibrate(
+            prepared,
+            names,
+            sds=sds,
+            starts=starts,
+            seed=seed,
+            cache=cache or default_cache(),
+            progress=progress,
+        )
+    path = replace(
+        found.model, name=out.stem, provenance={**dict(found.model.provenance), "command": _command()}
+    ).save(out)
+    if json:
+        _print_json(found.to_dict() | {"model_file": str(path)})
+        return
+    console = _console()
+    for p in found.parameters:
+        note = "" if p.identified else "   not identified"
+        console.print(
+            f"{p.name} = {_number(p.value)} {p.unit}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
+        )
+    console.print(
+        f"{found.agree} of {len(found.costs)} starts agree; {found.simulations} simulations, "
+        f"{found.from_cache} from the cache."
+    )
+    console.print(
+        "Error in multiples of the repeatability: "
+        + ", ".join(f"{k.replace('_', ' ')} {_number(v, 3)}" for k, v in found.errors.items())
+    )
+    for text in found.warnings:
+        console.print(f"warning: {text}", style="dim", markup=False)
+    console.print(f"Model file: {path}")

@@ -41,6 +41,8 @@ COMMANDS: tuple[Command, ...] = (
     Command("compare", "hannes_lab.cli:compare", "Compare the model with recorded closures: where does it fail?"),
     Command("diagnose", "hannes_lab.cli:diagnose", "Which physical effect does the model lack?"),
     Command("add", "hannes_lab.cli:add", "Add effects to the model, fit them, show the error fall."),
+    Command("calibrate", "hannes_lab.calibrate:command", "Identify named parameters of your hand from its bags."),
+    Command("validate", "hannes_lab.validation.cli:validate", "Hold the model against the thesis, row by row."),
     Command("hide", "hannes_lab.cli:hide", "Make a measurement set with a hidden effect."),
     Command("report", "hannes_lab.cli:report", "Compare, diagnose and add, on one HTML page."),
     Command("model", "hannes_bringup.cli.model:app", "Show models: parameters with provenance, effects."),

@@ -84,8 +84,14 @@ def logged(run: Rollout, period: float, start: float = PERIOD) -> Closure:
     first = round(start / period)
     current = logger(run.motor_current, period, rectified=True, window=LOG_WINDOW)
     part = slice(first, None)
-    return Closure(run.time[part] - run.time[first], current[part], run.encoder_position[part],
-                   run.reference_position[part], run.grip_force[part], run.motor_current[part])
+    return Closure(
+        run.time[part] - run.time[first],
+        current[part],
+        run.encoder_position[part],
+        run.reference_position[part],
+        run.grip_force[part],
+        run.motor_current[part],
+    )
 
 
 def figures(closure: Closure) -> dict[str, float]:
@@ -124,11 +130,18 @@ def slopes(time: Array, values: Array, window: float = SLOPE_WINDOW) -> Array:
     return out
 
 
-def closure_time(model: Model, current: float = PLATEAU_CURRENT, *, dt: float = 0.25e-3, limit: float = 4.0) -> float:
+def closure_time(
+    model: Model, current: float = PLATEAU_CURRENT, *, dt: float = 0.25e-3, limit: float = 4.0
+) -> float:
     """s until the encoder has made 40000 counts with a constant motor current from rest; NaN if it does not."""
     plant = make_plant(model, None, dt=dt)
-    gains = replace(DoublePIDParameters.from_parameters(model.parameters), kp=1.0, damping=0.0, current_limit=current,
-                    saver_time=1e3)
+    gains = replace(
+        DoublePIDParameters.from_parameters(model.parameters),
+        kp=1.0,
+        damping=0.0,
+        current_limit=current,
+        saver_time=1e3,
+    )
     run = rollout(plant, DoublePID(gains), np.full(round(limit / 1e-3), 1e3), joints=False)
     q = run.encoder_position
     if q.max() < FULL_CLOSURE:
@@ -139,12 +152,21 @@ def closure_time(model: Model, current: float = PLATEAU_CURRENT, *, dt: float = 
 
 def frictionless(model: Model) -> Model:
     """The model without any dry or viscous friction (R06)."""
-    names = ("friction.coulomb", "friction.viscous", "joints.friction_tension", "joints.damping_tension",
-             "carts.friction", "carts.damping", "hand.coulomb", "hand.viscous")
+    names = (
+        "friction.coulomb",
+        "friction.viscous",
+        "joints.friction_tension",
+        "joints.damping_tension",
+        "carts.friction",
+        "carts.damping",
+        "hand.coulomb",
+        "hand.viscous",
+    )
     kept = tuple(e for e in model.effects if not e.name.endswith("friction"))
     return replace(model.with_values(dict.fromkeys(names, 0.0)), effects=kept)
 
 
 def mean_and_sd(values: Sequence[float]) -> tuple[float, float]:
+    """Mean and standard deviation of the finite values."""
     a = np.array([v for v in values if math.isfinite(v)])
     return (float(a.mean()), float(a.std(ddof=1)) if a.size > 1 else 0.0) if a.size else (math.nan, math.nan)

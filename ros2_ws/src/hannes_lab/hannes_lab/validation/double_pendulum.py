@@ -30,8 +30,12 @@ from .table import Figure, Section
 
 Array = NDArray[np.float64]
 
-START_DEG: Mapping[str, tuple[float, float]] = {"index": (11.76, 16.32), "middle": (14.04, 19.41),
-                                               "ring": (11.76, 16.32), "little": (6.90, 14.57)}
+START_DEG: Mapping[str, tuple[float, float]] = {
+    "index": (11.76, 16.32),
+    "middle": (14.04, 19.41),
+    "ring": (11.76, 16.32),
+    "little": (6.90, 14.57),
+}
 """Start of the drop test, deg: th1 and PIP; the thesis does not give them, so they are solved from R01."""
 
 GRAVITY = 9.80665
@@ -39,8 +43,18 @@ GRAVITY = 9.80665
 END_DEG = (82.0, 50.0)
 """deg: the phalanx has dropped when th1 is there, the middle link when the PIP is."""
 
-ANALYTIC = {"index": (0.163, 0.078), "middle": (0.161, 0.077), "ring": (0.163, 0.078), "little": (0.161, 0.068)}
-SIMULATED = {"index": (0.159, 0.077), "middle": (0.157, 0.077), "ring": (0.159, 0.080), "little": (0.164, 0.064)}
+ANALYTIC = {
+    "index": (0.163, 0.078),
+    "middle": (0.161, 0.077),
+    "ring": (0.163, 0.078),
+    "little": (0.161, 0.068),
+}
+SIMULATED = {
+    "index": (0.159, 0.077),
+    "middle": (0.157, 0.077),
+    "ring": (0.159, 0.080),
+    "little": (0.164, 0.064),
+}
 """s; the thesis' Table 2."""
 
 LINKS = ("phalanx", "middle")
@@ -63,26 +77,36 @@ class Pendulum:
     def of(cls, parameters: ParameterSet, finger: str) -> Pendulum:
         v = parameters.value
         names = ("m1", "m2", "lm1", "lm2", "j1", "j2")
-        return cls(**{n: v(f"inertia.{finger}_{n}") for n in names}, l1=v(f"geometry.{finger}_proximal"),
-                   g=GRAVITY)
+        return cls(
+            **{n: v(f"inertia.{finger}_{n}") for n in names}, l1=v(f"geometry.{finger}_proximal"), g=GRAVITY
+        )
 
     def acceleration(self, th1: float, th2: float, w1: float, w2: float) -> tuple[float, float]:
         """rad/s2 of both absolute angles."""
         d, c = th1 - th2, self.m2 * self.l1 * self.lm2
-        mass = np.array([[self.j1 + self.m1 * self.lm1**2 + self.m2 * self.l1**2, c * math.cos(d)],
-                         [c * math.cos(d), self.j2 + self.m2 * self.lm2**2]])
-        force = np.array([
-            self.g * (self.m1 * self.lm1 + self.m2 * self.l1) * math.sin(th1) - c * math.sin(d) * w2 * w2,
-            self.g * self.m2 * self.lm2 * math.sin(th2) + c * math.sin(d) * w1 * w1])
+        mass = np.array(
+            [
+                [self.j1 + self.m1 * self.lm1**2 + self.m2 * self.l1**2, c * math.cos(d)],
+                [c * math.cos(d), self.j2 + self.m2 * self.lm2**2],
+            ]
+        )
+        force = np.array(
+            [
+                self.g * (self.m1 * self.lm1 + self.m2 * self.l1) * math.sin(th1) - c * math.sin(d) * w2 * w2,
+                self.g * self.m2 * self.lm2 * math.sin(th2) + c * math.sin(d) * w1 * w1,
+            ]
+        )
         a1, a2 = np.linalg.solve(mass, force)
         return float(a1), float(a2)
 
     def energy(self, state: Array) -> float:
         """Kinetic and potential energy, J, of (th1, th2, th1', th2')."""
         th1, th2, w1, w2 = state
-        kinetic = (0.5 * (self.j1 + self.m1 * self.lm1**2 + self.m2 * self.l1**2) * w1 * w1
-                   + 0.5 * (self.j2 + self.m2 * self.lm2**2) * w2 * w2
-                   + self.m2 * self.l1 * self.lm2 * math.cos(th1 - th2) * w1 * w2)
+        kinetic = (
+            0.5 * (self.j1 + self.m1 * self.lm1**2 + self.m2 * self.l1**2) * w1 * w1
+            + 0.5 * (self.j2 + self.m2 * self.lm2**2) * w2 * w2
+            + self.m2 * self.l1 * self.lm2 * math.cos(th1 - th2) * w1 * w2
+        )
         height = (self.m1 * self.lm1 + self.m2 * self.l1) * math.cos(th1) + self.m2 * self.lm2 * math.cos(th2)
         return float(kinetic + self.g * height)
 
@@ -95,14 +119,25 @@ class Pendulum:
             return [s[2], s[3], *self.acceleration(s[0], s[1], s[2], s[3])]
 
         events = [lambda _, s: s[0] - ends[0], lambda _, s: s[1] - s[0] - ends[1]]
-        found = solve_ivp(rate, (0.0, 1.0), [th1, th1 + pip, 0.0, 0.0], method="DOP853", rtol=1e-11, atol=1e-12,
-                          events=events)
+        found = solve_ivp(
+            rate,
+            (0.0, 1.0),
+            [th1, th1 + pip, 0.0, 0.0],
+            method="DOP853",
+            rtol=1e-11,
+            atol=1e-12,
+            events=events,
+        )
         if any(times.size == 0 for times in found.t_events):
-            raise HannesError("The falling finger does not reach the end of the drop test within 1 s; check gravity.")
+            raise HannesError(
+                "The falling finger does not reach the end of the drop test within 1 s; check gravity."
+            )
         return float(found.t_events[0][0]), float(found.t_events[1][0])
 
 
-def simulated_drop_times(model: Model, dt: float = 0.25e-3) -> tuple[dict[str, tuple[float, float]], dict[str, Array]]:
+def simulated_drop_times(
+    model: Model, dt: float = 0.25e-3
+) -> tuple[dict[str, tuple[float, float]], dict[str, Array]]:
     """Drop times [s] of all fingers in the plant's own multi-body model, and the angles (n, 2) in rad per finger.
 
     The model is the plant's; the stops, springs, friction and damping of the fingers are off and the wires slack.
@@ -123,7 +158,10 @@ def simulated_drop_times(model: Model, dt: float = 0.25e-3) -> tuple[dict[str, t
     d.joint("motor").qpos[0] = -1.0
     columns = []
     for finger, (th1, pip) in START_DEG.items():
-        d.joint(f"{finger}_mcp").qpos[0], d.joint(f"{finger}_pip").qpos[0] = math.radians(th1), math.radians(pip)
+        d.joint(f"{finger}_mcp").qpos[0], d.joint(f"{finger}_pip").qpos[0] = (
+            math.radians(th1),
+            math.radians(pip),
+        )
         columns += [int(m.joint(f"{finger}_{j}").qposadr[0]) for j in ("mcp", "pip")]
     steps = round(0.25 / dt)
     log = np.empty((steps + 1, len(columns)))
@@ -135,14 +173,18 @@ def simulated_drop_times(model: Model, dt: float = 0.25e-3) -> tuple[dict[str, t
     for n, finger in enumerate(START_DEG):
         q = log[:, 2 * n : 2 * n + 2]
         angles[finger] = q
-        out[finger] = (_crossing(time, q[:, 0], math.radians(END_DEG[0])),
-                       _crossing(time, q[:, 1], math.radians(END_DEG[1])))
+        out[finger] = (
+            _crossing(time, q[:, 0], math.radians(END_DEG[0])),
+            _crossing(time, q[:, 1], math.radians(END_DEG[1])),
+        )
     return out, angles
 
 
 def _crossing(time: Array, q: Array, level: float) -> float:
     if not (q >= level).any():
-        raise HannesError("A falling finger does not reach the end of the drop test within 0.25 s; check gravity.")
+        raise HannesError(
+            "A falling finger does not reach the end of the drop test within 0.25 s; check gravity."
+        )
     k = int(np.argmax(q >= level))
     return float(np.interp(level, q[k - 1 : k + 1], time[k - 1 : k + 1]))
 
@@ -155,24 +197,54 @@ def run(model: Model, dt: float = 0.25e-3) -> Section:
     for finger in FINGERS:
         for k, link in enumerate(LINKS):
             own, given = analytic[finger][k], ANALYTIC[finger][k]
-            figures.append(Figure("R01", f"{finger} {link}, analytic value off Table 2 by", "s", 0.001, math.nan,
-                                  abs(own - given), kind="at_most", role="fitted"))
+            figures.append(
+                Figure(
+                    "R01",
+                    f"{finger} {link}, analytic value off Table 2 by",
+                    "s",
+                    0.001,
+                    math.nan,
+                    abs(own - given),
+                    kind="at_most",
+                    role="fitted",
+                )
+            )
     for finger in FINGERS:
         for k, link in enumerate(LINKS):
             error = (ANALYTIC[finger][k] - SIMULATED[finger][k]) / ANALYTIC[finger][k]
             own = analytic[finger][k]
             # the thesis' simulation, moved to our analytic value so that its error stays its own
-            figures.append(Figure("R02-03", f"{finger} {link}, drop time", "s", own, own * (1.0 - error),
-                                  simulated[finger][k], limit=0.005))
+            figures.append(
+                Figure(
+                    "R02-03",
+                    f"{finger} {link}, drop time",
+                    "s",
+                    own,
+                    own * (1.0 - error),
+                    simulated[finger][k],
+                    limit=0.005,
+                )
+            )
     notes = (
-        "The start angles (th1 / PIP: " + ", ".join(f"{f} {a}/{b}" for f, (a, b) in START_DEG.items())
-        + " deg) are not in the thesis; they are chosen so that R01 comes out: two angles for two times, so R01 tests "
+        "The start angles (th1 / PIP: "
+        + ", ".join(f"{f} {a}/{b}" for f, (a, b) in START_DEG.items())
+        + " deg) are not in the thesis; they are chosen so that R01 comes out: two angles for two "
+        "times, so R01 tests "
         "nothing but consistency, and the lengths are not identified by it. R02-03, MuJoCo against the independent "
         "integration, has no free number.",
-        "Desired is the analytic value of the same parameters; the thesis' column is its Table 2 error on that value.",
+        "Desired is the analytic value of the same parameters; the thesis' column is its Table 2 "
+        "error on that value.",
         "Euler-Lagrange without the thesis' extra term (X12), integrated by DOP853 at 1e-11; MuJoCo at "
-        f"{1e3 * dt:g} ms with stops, springs and friction off. The thesis does not give the hand's pose: lying palm down "
-        "(P02), with the finger horizontal, the middle link would lag behind the phalanx and no start angles give R01; "
-        "standing with the fingers up, they do.")
-    return Section(("R01", "R02", "R03"), "drop times", tuple(figures), notes,
-                   {"angles": angles, "analytic": analytic, "simulated": simulated})
+        f"{1e3 * dt:g} ms with stops, springs and friction off. The thesis does not give the hand's "
+        "pose: lying palm down "
+        "(P02), with the finger horizontal, the middle link would lag behind the phalanx and no "
+        "start angles give R01; "
+        "standing with the fingers up, they do.",
+    )
+    return Section(
+        ("R01", "R02", "R03"),
+        "drop times",
+        tuple(figures),
+        notes,
+        {"angles": angles, "analytic": analytic, "simulated": simulated},
+    )

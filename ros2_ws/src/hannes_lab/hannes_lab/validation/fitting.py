@@ -37,30 +37,66 @@ TARGETS = (
 """The thesis' measurements on the real hand; the standard deviations are how well each figure is defined."""
 
 MOTORS: Mapping[str, Mapping[str, float]] = {
-    "2642W012CR": {"motor.resistance": 1.49, "motor.inductance": 137e-6, "motor.kt": 0.01745, "motor.armature": 1.1e-6,
-                   "friction.coulomb": 0.0255, "gear.efficiency": 0.7},
-    "2342S012CR": {"motor.resistance": 1.9, "motor.inductance": 68e-6, "motor.kt": 0.0134, "motor.armature": 5.8e-7,
-                   "friction.coulomb": 0.0168, "gear.efficiency": 0.88},
+    "2642W012CR": {
+        "motor.resistance": 1.49,
+        "motor.inductance": 137e-6,
+        "motor.kt": 0.01745,
+        "motor.armature": 1.1e-6,
+        "friction.coulomb": 0.0255,
+        "gear.efficiency": 0.7,
+    },
+    "2342S012CR": {
+        "motor.resistance": 1.9,
+        "motor.inductance": 68e-6,
+        "motor.kt": 0.0134,
+        "motor.armature": 5.8e-7,
+        "friction.coulomb": 0.0168,
+        "gear.efficiency": 0.88,
+    },
 }
 """Two motors that fit the currents alike (thesis section 4): winding, rotor, dry friction from the no-load current."""
 
 LEVER = "least_force.lever"
 
-_PRIORS: Mapping[str, float] = {"friction.coulomb": 0.5, "friction.viscous": 1.0, "control.kp": 0.5,
-                                "control.damping": 0.5, "gear.efficiency": 0.2, "wires.master_stiffness": 1.5}
+_PRIORS: Mapping[str, float] = {
+    "friction.coulomb": 0.5,
+    "friction.viscous": 1.0,
+    "control.kp": 0.5,
+    "control.damping": 0.5,
+    "gear.efficiency": 0.2,
+    "wires.master_stiffness": 1.5,
+}
 """Free parameters of the model with the prior standard deviation of their logarithm."""
 
-_START: Mapping[str, float] = {"friction.coulomb": 0.02, "friction.viscous": 0.0012, "control.kp": 0.9,
-                               "control.damping": 0.03, "gear.efficiency": 0.95, "wires.master_stiffness": 1e4,
-                               f"{EFFECT}.coefficient": 0.75, LEVER: 0.17}
+_START: Mapping[str, float] = {
+    "friction.coulomb": 0.02,
+    "friction.viscous": 0.0012,
+    "control.kp": 0.9,
+    "control.damping": 0.03,
+    "gear.efficiency": 0.95,
+    "wires.master_stiffness": 1e4,
+    f"{EFFECT}.coefficient": 0.75,
+    LEVER: 0.17,
+}
 """Where the first search starts; the others start at random points around it."""
 
 
 def coordinates(model: Model) -> list[Coordinate]:
     """What is free: six parameters, the capstan friction, and the lever of R04."""
-    out = [Coordinate(name, model.parameters.value(name), sd, True, model.parameters[name].lower,
-                      model.parameters[name].upper, True, 0.02 / sd, model.parameters[name].unit)
-           for name, sd in _PRIORS.items()]
+    out = [
+        Coordinate(
+            name,
+            model.parameters.value(name),
+            sd,
+            True,
+            model.parameters[name].lower,
+            model.parameters[name].upper,
+            True,
+            0.02 / sd,
+            model.parameters[name].unit,
+        )
+        for name, sd in _PRIORS.items()
+    ]
     out.append(Coordinate(f"{EFFECT}.coefficient", 0.3, 1.0, True, 0.01, 1.0, True, 0.02, "1"))
     out.append(Coordinate(LEVER, 0.24, 0.4, True, 0.05, 1.0, True, 0.05, "1"))
     return out
@@ -95,9 +131,16 @@ def predict(model: Model, values: Mapping[str, float]) -> Mapping[str, float]:
     return {**found, "plateau": void["plateau"], "closure_time": closure_time(hand, limit=2.5)}
 
 
-def calibrate_thesis(*, motor: str = "2642W012CR", starts: int = 2, seed: int = 0, evaluations: int = 12,
-                     cache: Path | None = None, progress: Progress | None = None,
-                     first: Mapping[str, float] | None = None) -> Calibration:
+def calibrate_thesis(
+    *,
+    motor: str = "2642W012CR",
+    starts: int = 2,
+    seed: int = 0,
+    evaluations: int = 12,
+    cache: Path | None = None,
+    progress: Progress | None = None,
+    first: Mapping[str, float] | None = None,
+) -> Calibration:
     """Calibrate the hand on TARGETS; the model in the result is complete, with objects and lever in its provenance."""
     base = base_model(motor)
     free = coordinates(base)
@@ -107,24 +150,42 @@ def calibrate_thesis(*, motor: str = "2642W012CR", starts: int = 2, seed: int = 
             if c.name in ("friction.coulomb", "gear.efficiency"):
                 begin[c.name] = 0.0
     problem = TargetProblem(TARGETS, predict, "bench test 4")
-    found = calibrate_targets(problem, base, free, starts=starts, seed=seed, evaluations=evaluations, cache=cache,
-                              first=begin, progress=progress)
+    found = calibrate_targets(
+        problem,
+        base,
+        free,
+        starts=starts,
+        seed=seed,
+        evaluations=evaluations,
+        cache=cache,
+        first=begin,
+        progress=progress,
+    )
     return replace(found, model=_finished(found, base, motor))
 
 
 def _finished(found: Calibration, base: Model, motor: str) -> Model:
     values = found.best.values
     hand = found.model.with_values(
-        least_force.preloads_for(found.model, least_force.ANALYTIC, values[LEVER]), status="identified",
-        source=f"solved from R04 (analytic) with the force at {values[LEVER]:.4f} of the distance to the tip pad")
+        least_force.preloads_for(found.model, least_force.ANALYTIC, values[LEVER]),
+        status="identified",
+        source=f"solved from R04 (analytic) with the force at {values[LEVER]:.4f} of the distance to the tip pad",
+    )
     rows = list(dict.fromkeys(t.row for t in TARGETS))
     provenance: dict[str, Any] = {
         "command": "hannes validate --calibrate" + (f" --motor {motor}" if motor != "2642W012CR" else ""),
-        "fitted_to": [*rows, "R04 (analytic forces)"], "motor": motor, "lever": float(values[LEVER]),
-        "free_parameters": len(found.parameters), "targets": len(TARGETS),
-        "nominal_sha256": base.sha256, "cost": float(found.costs[0]), "starts": len(found.costs), "agree": found.agree,
+        "fitted_to": [*rows, "R04 (analytic forces)"],
+        "motor": motor,
+        "lever": float(values[LEVER]),
+        "free_parameters": len(found.parameters),
+        "targets": len(TARGETS),
+        "nominal_sha256": base.sha256,
+        "cost": float(found.costs[0]),
+        "starts": len(found.costs),
+        "agree": found.agree,
         "intervals_95": {p.name: [float(f"{p.low:.5g}"), float(f"{p.high:.5g}")] for p in found.parameters},
-        "warnings": list(found.warnings)}
+        "warnings": list(found.warnings),
+    }
     hand = replace(hand, provenance=provenance)
     provenance["objects"] = {"soft": {"stiffness": float(fit_soft_stiffness(hand))}}
     name = "thesis_hand" if motor == "2642W012CR" else f"thesis_hand_{motor[:4]}"

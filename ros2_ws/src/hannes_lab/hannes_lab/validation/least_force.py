@@ -75,8 +75,15 @@ def preloads_for(model: Model, forces: Mapping[str, float], lever: float = LEVER
     return out
 
 
-def onset(model: Model, digit: str, lever: float = LEVER, *, friction: bool = False, rate: float = 0.3,
-          dt: float = 0.25e-3) -> float:
+def onset(
+    model: Model,
+    digit: str,
+    lever: float = LEVER,
+    *,
+    friction: bool = False,
+    rate: float = 0.3,
+    dt: float = 0.25e-3,
+) -> float:
     """Force [N] at which the simulated phalanx leaves its stop, on a ramp of `rate` N/s.
 
     The return wire acts, the flexor wires are slack, the joint before the distal one is held.  Without friction the
@@ -117,7 +124,9 @@ def onset(model: Model, digit: str, lever: float = LEVER, *, friction: bool = Fa
         if k * dt > 0.2 and d.qpos[at] > 0.0 and d.qvel[dof] > slowest:
             return before
         before = force
-    raise HannesError(f"The {digit}'s distal phalanx did not move at {force:.2f} N; check springs.{digit}_preload.")
+    raise HannesError(
+        f"The {digit}'s distal phalanx did not move at {force:.2f} N; check springs.{digit}_preload."
+    )
 
 
 def run(model: Model, dt: float = 0.25e-3) -> Section:
@@ -130,21 +139,52 @@ def run(model: Model, dt: float = 0.25e-3) -> Section:
         simulated[digit] = onset(model, digit, lever, dt=dt)
         stuck[digit] = onset(model, digit, lever, friction=True, dt=dt)
         thesis = own[digit] * SIMULATED[digit] / ANALYTIC[digit]
-        figures.append(Figure("R04", f"{digit}, least force, simulated onset against balance", "N", own[digit], thesis,
-                              simulated[digit], limit=0.005))
+        figures.append(
+            Figure(
+                "R04",
+                f"{digit}, least force, simulated onset against balance",
+                "N",
+                own[digit],
+                thesis,
+                simulated[digit],
+                limit=0.005,
+            )
+        )
     for digit in simulated:
-        figures.append(Figure("R04", f"{digit}, least force with dry friction", "N", rubbing[digit], float("nan"),
-                              stuck[digit], limit=0.005))
+        figures.append(
+            Figure(
+                "R04",
+                f"{digit}, least force with dry friction",
+                "N",
+                rubbing[digit],
+                float("nan"),
+                stuck[digit],
+                limit=0.005,
+            )
+        )
     for digit in simulated:
-        figures.append(Figure("R04", f"{digit}, balance against the thesis' analytic value", "N", ANALYTIC[digit],
-                              float("nan"), own[digit], limit=0.005, role="fitted"))
+        figures.append(
+            Figure(
+                "R04",
+                f"{digit}, balance against the thesis' analytic value",
+                "N",
+                ANALYTIC[digit],
+                float("nan"),
+                own[digit],
+                limit=0.005,
+                role="fitted",
+            )
+        )
     notes = (
         f"The thesis gives forces, not where they act. With the force at the tip the preloads would ask more current "
         f"to close than R07 gives. Here it acts at {lever:.3g} of the distance from joint to tip pad on every digit; "
         "five preloads are then solved from the five analytic forces, so that the last five lines are met by "
         "construction. Lever and preload are told apart by the void current alone.",
-        "The thesis' forces are rounded to 0.01 N, up to 0.5 % of them: where its error is printed as 0, being closer is "
+        "The thesis' forces are rounded to 0.01 N, up to 0.5 % of them: where its error is printed "
+        "as 0, being closer is "
         "not defined.",
-        "Joint before the distal one held, flexor wires slack, palm down; the thesis' column is its simulation's error "
-        "on the same balance.")
+        "Joint before the distal one held, flexor wires slack, palm down; the thesis' column is its "
+        "simulation's error "
+        "on the same balance.",
+    )
     return Section(("R04",), "least force that moves the distal phalanx", tuple(figures), notes)

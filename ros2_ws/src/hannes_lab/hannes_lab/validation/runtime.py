@@ -18,8 +18,11 @@ from hannes_sim.rollout import rollout
 from .currents import object_for
 from .table import Figure, Section
 
-THESIS = {("return_wire", "wires"): 12 * 3600.0, ("torsion_spring", "wires"): 28 * 60.0,
-          ("torsion_spring", "forces"): 60.0}
+THESIS = {
+    ("return_wire", "wires"): 12 * 3600.0,
+    ("torsion_spring", "wires"): 28 * 60.0,
+    ("torsion_spring", "forces"): 60.0,
+}
 """s of one simulation in the thesis."""
 
 REPEATS = 3
@@ -66,18 +69,37 @@ def run(model: Model) -> Section:
     full = np.inf
     for mechanism in RETURN_MECHANISMS:
         for transmission in TRANSMISSIONS:
-            chosen = replace(model, variant={**model.variant, "return_mechanism": mechanism,
-                                             "transmission": transmission})
+            chosen = replace(
+                model, variant={**model.variant, "return_mechanism": mechanism, "transmission": transmission}
+            )
             for name in ("void", "rigid"):
                 seconds = wall_time(MujocoPlant(chosen, object_for(model, name)), controller, reference)
                 limit = THESIS.get((mechanism, transmission), float("nan"))
-                out.append(Figure("R16", f"{mechanism} and {transmission}, {name}: wall time of a {duration:g} s closure",
-                                  "s", limit if np.isfinite(limit) else 60.0, limit, seconds, kind="at_most",
-                                  note=f"{duration / seconds:.1f} x real time"))
+                out.append(
+                    Figure(
+                        "R16",
+                        f"{mechanism}, {transmission}, {name}: wall time of one closure",
+                        "s",
+                        limit if np.isfinite(limit) else 60.0,
+                        limit,
+                        seconds,
+                        kind="at_most",
+                        note=f"{duration / seconds:.1f} x real time",
+                    )
+                )
                 if (mechanism, transmission) == ("return_wire", "wires"):
                     full = min(full, duration / seconds)
-    out.append(Figure("R16", "return_wire and wires, slower object: real-time factor on one core", "1", FACTOR,
-                      duration / THESIS["return_wire", "wires"], full, kind="at_least"))
+    out.append(
+        Figure(
+            "R16",
+            "return_wire and wires, slower object: real-time factor on one core",
+            "1",
+            FACTOR,
+            duration / THESIS["return_wire", "wires"],
+            full,
+            kind="at_least",
+        )
+    )
     bit = mujoco.mjtDisableBit
     base = profile(model, None)
     bare = profile(model, None, disable=int(bit.mjDSBL_CONSTRAINT))
@@ -92,8 +114,10 @@ def run(model: Model) -> Section:
         f"Of {base:.1f} us a step (void, nv {size['nv']}, {size['nbody']} bodies, dt {1e3 * size['dt']:g} ms), "
         f"{base - bare:.1f} us are the constraints (dry friction of every joint, stops, wires: Newton's method), "
         f"{bare:.1f} us kinematics, inertia and integration.",
-        "What MuJoCo offers, us a step: " + ", ".join(f"{k} {v:.1f}" for k, v in tries.items())
-        + f"; chosen: no islands, dense Jacobian, Newton, implicitfast, {base:.1f}. Control law, motor and effects run as "
-        "machine code beside mj_step.",
-        "Best of a few runs on one core; the figures depend on the machine and on what else runs on it.")
+        "What MuJoCo offers, us a step: "
+        + ", ".join(f"{k} {v:.1f}" for k, v in tries.items())
+        + f"; chosen: no islands, dense Jacobian, Newton, implicitfast, {base:.1f}. Control law, motor and effects "
+        "run as machine code beside mj_step.",
+        "Best of a few runs on one core; the figures depend on the machine and on what else runs on it.",
+    )
     return Section(("R16",), "run time", tuple(out), notes)

@@ -69,8 +69,22 @@ class Figure:
         return bool(self.closer)
 
     def to_dict(self) -> dict[str, Any]:
-        names = ("row", "name", "unit", "desired", "thesis", "thesis_error", "ours", "error", "closer", "met", "kind",
-                 "limit", "role", "note")
+        names = (
+            "row",
+            "name",
+            "unit",
+            "desired",
+            "thesis",
+            "thesis_error",
+            "ours",
+            "error",
+            "closer",
+            "met",
+            "kind",
+            "limit",
+            "role",
+            "note",
+        )
         return {name: getattr(self, name) for name in names}
 
 
@@ -88,8 +102,12 @@ class Section:
     curves: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        return {"rows": list(self.rows), "title": self.title, "notes": list(self.notes),
-                "figures": [f.to_dict() for f in self.figures]}
+        return {
+            "rows": list(self.rows),
+            "title": self.title,
+            "notes": list(self.notes),
+            "figures": [f.to_dict() for f in self.figures],
+        }
 
 
 def _relative(desired: float, value: float) -> float:
@@ -132,21 +150,48 @@ def cells(figure: Figure) -> tuple[str, ...]:
     """One line of the table."""
     closer = {True: "closer", False: "**not closer**", None: "-"}[figure.closer]
     desired = number(figure.desired) if figure.kind == "value" else "-"
-    return (figure.row, figure.name, figure.unit, desired, number(figure.thesis), percent(figure.thesis_error),
-            number(figure.ours), percent(figure.error) if figure.kind == "value" else "-", closer, target(figure),
-            verdict(figure), figure.role)
+    return (
+        figure.row,
+        figure.name,
+        figure.unit,
+        desired,
+        number(figure.thesis),
+        percent(figure.thesis_error),
+        number(figure.ours),
+        percent(figure.error) if figure.kind == "value" else "-",
+        closer,
+        target(figure),
+        verdict(figure),
+        figure.role,
+    )
 
 
-HEADINGS = ("row", "figure", "unit", "real hand / analytic", "thesis' model", "error", "this model", "error", "closer?",
-            "target", "reached?", "role")
+HEADINGS = (
+    "row",
+    "figure",
+    "unit",
+    "real hand / analytic",
+    "thesis' model",
+    "error",
+    "this model",
+    "error",
+    "closer?",
+    "target",
+    "reached?",
+    "role",
+)
 
 
 def markdown(sections: Sequence[Section]) -> str:
     """All sections as Markdown tables with their notes."""
     out: list[str] = []
     for section in sections:
-        out += [f"## {', '.join(section.rows)}: {section.title}", "", "| " + " | ".join(HEADINGS) + " |",
-                "|" + "---|" * len(HEADINGS)]
+        out += [
+            f"## {', '.join(section.rows)}: {section.title}",
+            "",
+            "| " + " | ".join(HEADINGS) + " |",
+            "|" + "---|" * len(HEADINGS),
+        ]
         out += ["| " + " | ".join(cells(figure)) + " |" for figure in section.figures]
         out.append("")
         remarks = [f"{f.row} {f.name}: {f.note}" for f in section.figures if f.note]

@@ -2,7 +2,7 @@
 
 R14  torsion springs M = M0 + k q in every joint instead of the return wires (moment preload + rate x travel of the
      wire, shared by both joints of a digit)
-R15  forces on the joints instead of pulleys and wires: flexor arms of the `forces` transmission
+R15  forces on the joints instead of pulleys and wires: the `forces` transmission
 
 Both are fitted to the joint angles of the full hand (void closure, same controller and reference) by Gauss-Newton; the
 RMSE is over closing and opening.
@@ -20,6 +20,7 @@ from hannes_control.reference import half_sine
 from hannes_description.joints import DIGITS, FINGERS, JOINT_NAMES
 from hannes_description.mjcf import joints_of, return_moments
 from hannes_description.model import Model
+from hannes_sim import mujoco_plant
 from hannes_sim.mujoco_plant import MujocoPlant
 from hannes_sim.plant import PlantDiverged
 from hannes_sim.rollout import rollout
@@ -33,18 +34,36 @@ FLEXED = tuple(joint for digit in DIGITS for joint in joints_of(digit))
 """The nine joints that wires flex."""
 
 SPRINGS: Mapping[str, float] = {
-    "thumb_abd": 0.0493, "index_mcp": 0.0112, "index_pip": 0.0399, "middle_mcp": 0.0107, "middle_pip": 0.0399,
-    "ring_mcp": 0.0099, "ring_pip": 0.0964, "little_mcp": 0.0242, "little_pip": 0.0615}
+    "thumb_abd": 0.0493,
+    "index_mcp": 0.0112,
+    "index_pip": 0.0399,
+    "middle_mcp": 0.0107,
+    "middle_pip": 0.0399,
+    "ring_mcp": 0.0099,
+    "ring_pip": 0.0964,
+    "little_mcp": 0.0242,
+    "little_pip": 0.0615,
+}
 FORCES: Mapping[str, float] = {
-    "index_mcp": 0.0256, "index_pip": 0.0108, "middle_mcp": 0.0625, "middle_pip": 0.0478, "ring_mcp": 0.0751,
-    "ring_pip": 0.0683, "little_mcp": 0.0595, "little_pip": 0.0556}
+    "index_mcp": 0.0256,
+    "index_pip": 0.0108,
+    "middle_mcp": 0.0625,
+    "middle_pip": 0.0478,
+    "ring_mcp": 0.0751,
+    "ring_pip": 0.0683,
+    "little_mcp": 0.0595,
+    "little_pip": 0.0556,
+}
 """rad; the thesis' RMSE."""
 
 FLOOR = 0.01
 """rad; half the thesis' RMSE or this, whichever is larger, is asked."""
 
-DURATION = 2.2
-"""s of the closure that are compared: closing and opening."""
+ITERATIONS = 14
+
+DURATION = 2.0
+"""s of the closure that are compared: the reference's rise and fall.  After it the motor overshoots the open hand; wires
+go slack, the forces transmission pushes, and no parameter of it can help that."""
 
 _COLUMNS = [JOINT_NAMES.index(joint) for joint in FLEXED]
 
@@ -82,16 +101,33 @@ class Springs:
 
 
 class Forces:
-    """The forces transmission with free arms; x holds the logarithms of their ratio to the wires' arms."""
+    """The forces transmission; x holds logarithms of ratios to the full hand's values.
+
+    Nine flexor arms, and per digit the preload and rate of its return wire and the dry friction as tension: they take
+    over what carts and guides did (springs, friction).
+    """
 
     def __init__(self, model: Model) -> None:
         self.model = variant(model, transmission="forces")
-        self.size = len(FLEXED)
+        self.names = (
+            *(f"pulleys.{joint}" for joint in FLEXED),
+            *(f"springs.{digit}_{what}" for digit in DIGITS for what in ("preload", "rate")),
+        )
+        self.size = len(self.names) + len(DIGITS)
 
     def angles(self, x: Array) -> Array:
-        arms = {f"pulleys.{joint}": self.model.parameters.value(f"pulleys.{joint}") * math.exp(x[k])
-                for k, joint in enumerate(FLEXED)}
-        return closure(MujocoPlant(self.model.with_values(arms)), self.model)
+        v = self.model.parameters.value
+        plant = MujocoPlant(
+            self.model.with_values({name: v(name) * math.exp(x[k]) for k, name in enumerate(self.names)})
+        )
+        for k, digit in enumerate(DIGITS):
+            for joint in joints_of(digit):
+                level = (
+                    v("joints.friction_tension") * v(f"pulleys.{joint}") * math.exp(x[len(self.names) + k])
+                )
+                # the kernel's own table: it writes MuJoCo's dry friction from it at every step
+                plant._table[mujoco_plant._T_FRICTION + JOINT_NAMES.index(joint)] = level
+        return closure(plant, self.model)
 
 
 def rmse(a: Array, b: Array) -> Array:
@@ -100,12 +136,17 @@ def rmse(a: Array, b: Array) -> Array:
     return out
 
 
-def identify(kind: Springs | Forces, wanted: Array, *, iterations: int = 3,
-             tick: Callable[[], None] = lambda: None) -> tuple[Array, Array]:
+def identify(
+    kind: Springs | Forces,
+    wanted: Array,
+    *,
+    iterations: int = ITERATIONS,
+    tick: Callable[[], None] = lambda: None,
+) -> tuple[Array, Array]:
     """Parameters x and angles (n, 9) with the least RMSE over the joints, by damped Gauss-Newton."""
     x = np.zeros(kind.size)
     best = kind.angles(x)
-    damping = 1e-3
+    damping = 1e-2
     for _ in range(iterations):
         jacobian = np.empty((wanted.size, x.size))
         for k in range(x.size):
@@ -116,8 +157,9 @@ def identify(kind: Springs | Forces, wanted: Array, *, iterations: int = 3,
         residual = (wanted - best).ravel()
         square, gradient = jacobian.T @ jacobian, jacobian.T @ residual
         better = False
-        for _ in range(4):
-            move = np.clip(np.linalg.solve(square + damping * np.diag(np.diag(square) + 1e-9), gradient), -0.5, 0.5)
+        for _ in range(6):
+            scale = np.diag(np.diag(square) + 1e-3 * float(np.mean(np.diag(square))))
+            move = np.clip(np.linalg.solve(square + damping * scale, gradient), -0.4, 0.4)
             try:
                 trial = kind.angles(x + move)
             except PlantDiverged:
@@ -143,7 +185,7 @@ def run(model: Model, which: str, progress: Progress = silent) -> Section:
 
     def tick() -> None:
         done[0] += 1
-        progress(done[0], 3 * kind.size, f"{'R14' if which == 'springs' else 'R15'}: identification")
+        progress(done[0], ITERATIONS * kind.size, f"{'R14' if which == 'springs' else 'R15'}: identification")
 
     start = kind.angles(np.zeros(kind.size))
     x, best = identify(kind, wanted, tick=tick)
@@ -153,16 +195,43 @@ def run(model: Model, which: str, progress: Progress = silent) -> Section:
     figures = []
     for k, joint in enumerate(FLEXED):
         if joint in given:
-            figures.append(Figure(row, f"{joint}, RMSE, at most half the thesis' {given[joint]:g} or {FLOOR:g}", "rad",
-                                  max(FLOOR, 0.5 * given[joint]), given[joint], float(after[k]), kind="at_most",
-                                  role="fitted", note=f"before the identification {before[k]:.4f}"))
-    what = ("torsion springs (two numbers per joint, 18 in all)" if which == "springs"
-            else "forces on the joints (one arm per joint, 9 in all)")
+            figures.append(
+                Figure(
+                    row,
+                    f"{joint}, RMSE, at most half the thesis' {given[joint]:g} or {FLOOR:g}",
+                    "rad",
+                    max(FLOOR, 0.5 * given[joint]),
+                    given[joint],
+                    float(after[k]),
+                    kind="at_most",
+                    role="fitted",
+                    note=f"before the identification {before[k]:.4f}",
+                )
+            )
+    what = (
+        "torsion springs (two numbers per joint, 18 in all)"
+        if which == "springs"
+        else "forces on the joints (an arm per joint; preload, rate and dry friction per digit: 24 numbers)"
+    )
     names = ("return wires", "torsion springs") if which == "springs" else ("pulleys and wires", "forces")
-    notes = (f"{what} identified by least squares from the full hand's own angles over one void closure, closing and "
-             f"opening ({DURATION:g} s).",)
+    notes = (
+        f"{what} identified by least squares from the full hand's own angles over one void closure, closing and "
+        f"opening ({DURATION:g} s; after it the motor overshoots the open hand, wires go slack and forces push).",
+    )
     time = 0.004 * np.arange(wanted.shape[0])
     title = f"{names[0]} against {names[1]}"
-    return Section((row,), title, tuple(figures), notes,
-                   {"time": time, "full": wanted, "simple": best, "names": names, "joints": FLEXED, "x": x,
-                    "fingers": FINGERS})
+    return Section(
+        (row,),
+        title,
+        tuple(figures),
+        notes,
+        {
+            "time": time,
+            "full": wanted,
+            "simple": best,
+            "names": names,
+            "joints": FLEXED,
+            "x": x,
+            "fingers": FINGERS,
+        },
+    )
