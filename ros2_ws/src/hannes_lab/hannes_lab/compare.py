@@ -5,7 +5,7 @@ Aligned closures, errors per signal and phase, the thesis' figures, and the resi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -141,17 +141,18 @@ def compare(
     contact = _contact(prepared, values)
     labels = [_labels(features, block, contact) for block in features.blocks]
     errors = signal_errors(features, predicted)
+    names = [prepared.rig.phases.get(name, name) for name in PHASES]
     return Comparison(
         model,
         fitted,
         errors,
         overall(errors),
-        _cells(features, predicted, labels, seed),
+        _cells(features, predicted, labels, seed, names),
         tuple(
-            _overlay(features, b, p, lab)
+            _overlay(features, b, p, lab, names)
             for b, p, lab in zip(features.blocks, predicted, labels, strict=True)
         ),
-        _metrics(features, predicted, labels),
+        _metrics(features, predicted, labels) if prepared.rig.figures else (),
         residual_dependences(features, predicted),
         data_used(features),
         prepared.notes,
@@ -189,7 +190,7 @@ def _labels(
 
 
 def _cells(
-    features: Features, predicted: list[Array], labels: list[NDArray[np.int64]], seed: int
+    features: Features, predicted: list[Array], labels: list[NDArray[np.int64]], seed: int, names: Sequence[str]
 ) -> tuple[Cell, ...]:
     rng = np.random.default_rng(seed)
     rows: list[dict[str, Any]] = []
@@ -197,7 +198,7 @@ def _cells(
         e = block.measured - block.measured.mean(axis=0)
         residual = block.measured.mean(axis=0) - model.mean(axis=0)
         n = block.n
-        for k, name in enumerate(PHASES):
+        for k, name in enumerate(names):
             own = label == k
             if own.sum() < 3:
                 continue
@@ -239,7 +240,9 @@ def _benjamini_hochberg(p_values: list[float]) -> float:
     return float(p[passed].max()) if passed.any() else -1.0
 
 
-def _overlay(features: Features, block: Block, predicted: Array, label: NDArray[np.int64]) -> Overlay:
+def _overlay(
+    features: Features, block: Block, predicted: Array, label: NDArray[np.int64], names: Sequence[str]
+) -> Overlay:
     trial = features.trials[block.trial]
     closure = trial.of(block.condition)[0]
     spread = 2.0 * block.measured.std(axis=0, ddof=1) if block.n > 1 else np.zeros(block.phase.size)
@@ -255,7 +258,7 @@ def _overlay(features: Features, block: Block, predicted: Array, label: NDArray[
         mean + spread,
         predicted.mean(axis=0),
         np.interp(closure.start + block.phase, grid, trial.reference),
-        tuple(PHASES[k] for k in label),
+        tuple(names[k] for k in label),
     )
 
 

@@ -68,6 +68,7 @@ class HandRig(PlantRig):
 
     population = data_path("parameters", "population.yaml")
     figures = True
+    experiments = True
 
     def __init__(self, trials: Sequence[Trial]) -> None:
         super().__init__(trials)

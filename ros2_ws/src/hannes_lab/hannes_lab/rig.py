@@ -72,6 +72,9 @@ class Rig(Protocol):
     points    points of the phase grid of one closure at most
     without   effects that have no meaning on this machine, with the reason
     drive_signals  signals that tell force or torque of the drive
+    phases    other names for the phases void, grasp, hold, opening, rest
+    figures   True where the figures of a hand's closure (closing time, grip force ...) have a meaning
+    experiments  True where `hannes record` can run the experiments that separate effects
     pooled    True: in a fit every sample of a signal counts the same, and the fit is of least square error.  For
               machines that repeat far better than any model will fit; the exact moments would rule the fit otherwise
     """
@@ -81,6 +84,9 @@ class Rig(Protocol):
     points: int
     drive_signals: tuple[str, ...]
     pooled: bool
+    figures: bool
+    phases: Mapping[str, str]
+    experiments: bool
     without: Mapping[str, str]
 
     def nuisances(self, model: Model) -> Sequence[Nuisance]:
@@ -112,9 +118,7 @@ class PlantRig:
                  from REFERENCE_SIZES; effects are scaled by them
     linear       True where position is in m and the drive gives N: units are named so
     without      effects that have no meaning here, with the reason
-    floor, points, drive_signals, pooled  see Rig
-    phases       other names for the phases void, grasp, hold, opening, rest
-    figures      True where the figures of a hand's closure (closing time, grip force ...) have a meaning
+    floor, points, drive_signals, pooled, phases, figures, experiments  see Rig
 
     Plants are built once per (model structure, trial) and then only re-parametrised.
     """
@@ -128,8 +132,9 @@ class PlantRig:
     points: int = 160
     drive_signals: tuple[str, ...] = ("motor_current", "motor_effort")
     pooled: bool = False
-    phases: ClassVar[Mapping[str, str]] = {}
-    figures: ClassVar[bool] = False
+    phases: Mapping[str, str] = {}
+    figures: bool = False
+    experiments: bool = False
     source: ClassVar[str] = ""
 
     def __init__(self, trials: Sequence[Trial]) -> None:
