@@ -39,7 +39,9 @@ def problem(*names: str, sd: float = 1e-4) -> TargetProblem:
 
 
 def test_figures_give_back_their_truth() -> None:
-    found = calibrate_targets(problem("sum", "difference", "product"), NOMINAL, free_coordinates(NOMINAL, NAMES))
+    found = calibrate_targets(
+        problem("sum", "difference", "product"), NOMINAL, free_coordinates(NOMINAL, NAMES)
+    )
     values = {p.name: p for p in found.parameters}
     assert values["friction.coulomb"].value == pytest.approx(0.030, rel=2e-3)
     assert values["hand.preload"].value == pytest.approx(0.012, rel=2e-3)
@@ -53,7 +55,8 @@ def test_what_figures_cannot_tell_apart_is_said_with_the_pair() -> None:
     found = calibrate_targets(problem("sum"), NOMINAL, free_coordinates(NOMINAL, NAMES))
     assert not any(p.identified for p in found.parameters)
     assert any("friction.coulomb and hand.preload" in text for text in found.warnings) or any(
-        "confounded with" in text for text in found.warnings)
+        "confounded with" in text for text in found.warnings
+    )
     assert any("2 free parameters for 1 figures" in text for text in found.warnings)
 
 
@@ -76,14 +79,18 @@ def test_a_stopped_calibration_goes_on_from_its_folder(tmp_path: Path) -> None:
 
     coordinates = free_coordinates(NOMINAL, NAMES)
     with pytest.raises(Stopped):
-        calibrate_targets(problem("sum", "difference"), NOMINAL, coordinates, starts=1, cache=tmp_path, progress=stop)
+        calibrate_targets(
+            problem("sum", "difference"), NOMINAL, coordinates, starts=1, cache=tmp_path, progress=stop
+        )
     kept = len(list(tmp_path.glob("*.npy")))
     assert kept == 5
     again = calibrate_targets(problem("sum", "difference"), NOMINAL, coordinates, starts=1, cache=tmp_path)
     fresh = calibrate_targets(problem("sum", "difference"), NOMINAL, coordinates, starts=1)
     assert again.from_cache >= kept
     assert [p.value for p in again.parameters] == [p.value for p in fresh.parameters]
-    other = calibrate_targets(problem("sum", "difference", sd=2e-4), NOMINAL, coordinates, starts=1, cache=tmp_path)
+    other = calibrate_targets(
+        problem("sum", "difference", sd=2e-4), NOMINAL, coordinates, starts=1, cache=tmp_path
+    )
     assert other.from_cache == 0 or other.simulations > 0
 
 
@@ -95,8 +102,10 @@ def test_a_cut_file_in_the_cache_is_made_again(tmp_path: Path) -> None:
     assert np.array_equal(kept.residual(NOMINAL, {"friction.coulomb": 0.02}), first)
 
 
-@pytest.mark.parametrize(("names", "text"), [
-    ([], "Nothing is free"), (["friction.coulomb"] * 2, "twice"), (["friction.glue"], "friction.glue")])
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [([], "Nothing is free"), (["friction.coulomb"] * 2, "twice"), (["friction.glue"], "friction.glue")],
+)
 def test_bad_names_are_refused(names: list[str], text: str) -> None:
     with pytest.raises(HannesError, match=text):
         free_coordinates(NOMINAL, names)
@@ -104,7 +113,9 @@ def test_bad_names_are_refused(names: list[str], text: str) -> None:
 
 def test_a_hand_is_recovered_from_its_recordings(tmp_path: Path) -> None:
     hand = NOMINAL.with_values({"friction.coulomb": 0.034, "hand.preload": 0.0085})
-    recordings, _ = make_set(hand, [], seed=4, closures=4, conditions=("slow", "grasp"), sensors="bench", spread=0.0)
+    recordings, _ = make_set(
+        hand, [], seed=4, closures=4, conditions=("slow", "grasp"), sensors="bench", spread=0.0
+    )
     prepared = prepare(unique_names([make_trial(r) for r in recordings]), NOMINAL)
     found = calibrate(prepared, NAMES, starts=1, evaluations=8, cache=tmp_path)
     values = {p.name: p for p in found.parameters}
@@ -115,5 +126,5 @@ def test_a_hand_is_recovered_from_its_recordings(tmp_path: Path) -> None:
     assert found.model.provenance["bags"] and found.model.provenance["free"] == NAMES
     path = found.model.save(tmp_path / "my_hand.yaml")
     assert Model.load(path).sha256 == found.model.sha256
-    with pytest.raises(HannesError, match="control.kp"):
+    with pytest.raises(HannesError, match=r"control\.kp"):
         calibrate(prepared, ["control.kp"])

@@ -50,7 +50,9 @@ def test_the_onset_is_where_the_balance_says(digit: str) -> None:
 def test_a_model_with_another_preload_moves_at_another_force() -> None:
     hand = HAND.with_values({"springs.index_preload": 1.3 * HAND.parameters.value("springs.index_preload")})
     lever = least_force.lever_of(hand)
-    assert least_force.onset(hand, "index", lever) == pytest.approx(least_force.balance(hand, lever)["index"], rel=5e-3)
+    assert least_force.onset(hand, "index", lever) == pytest.approx(
+        least_force.balance(hand, lever)["index"], rel=5e-3
+    )
     assert least_force.balance(hand, lever)["index"] > 1.2 * least_force.balance(HAND, lever)["index"]
 
 

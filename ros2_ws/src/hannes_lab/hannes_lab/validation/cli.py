@@ -57,6 +57,11 @@ def document(model: Model, sections: list[Section], files: list[Path], command: 
     rows = sum(f.met for f in figures)
     closer = [f.closer for f in figures if f.closer is not None]
     missed = [f"{f.row} {f.name}" for f in figures if not f.met]
+    behind = [
+        f"{f.row} {f.name}" + (" (the thesis' error is 0 as printed)" if abs(f.thesis_error) < 1e-6 else "")
+        for f in figures
+        if f.closer is False
+    ]
     free, targets = model.provenance.get("free_parameters"), model.provenance.get("targets")
     intervals = model.provenance.get("intervals_95", {})
     lines = [
@@ -65,14 +70,16 @@ def document(model: Model, sections: list[Section], files: list[Path], command: 
         f"Made by `{command}`; model `{model.name}`, sha256 `{model.sha256}`; {seconds:.0f} s of wall "
         "time. Do not edit.",
         "",
-        'The rows are those of the thesis "Analysis and Optimization of Hannes prosthetic hand: a Multi-Body approach": '
+        'The rows are those of the thesis "Analysis and Optimization of Hannes prosthetic hand: a '
+        'Multi-Body approach": '
         "the real hand or the analytic value, the thesis' own model with its error, this model with "
         "its error. Relative "
         "errors are (desired - model) / desired.",
         "",
-        f"**{rows} of {len(figures)} figures reach their target; {sum(closer)} of {len(closer)} that "
-        "can be compared are "
-        "closer than the thesis' model.** " + (f"Not reached: {'; '.join(missed)}." if missed else "") + "",
+        f"**{rows} of {len(figures)} figures reach their target; {sum(closer)} of {len(closer)} that can be "
+        "compared are closer than the thesis' model.** "
+        + (f"Not reached: {'; '.join(missed)}. " if missed else "")
+        + (f"Not closer: {'; '.join(behind)}." if behind else ""),
         "",
     ]
     if free:

@@ -67,7 +67,9 @@ def object_for(model: Model, kind: str) -> GraspObject | None:
         raise HannesError(f"Unknown column '{kind}'; valid are {', '.join(OBJECTS)}.")
     grasp = OBJECTS[kind]
     given = model.provenance.get("objects", {}).get(kind, {})
-    return replace(grasp, **{k: float(v) for k, v in given.items()}) if grasp is not None else None
+    if grasp is None or not given:
+        return grasp
+    return GraspObject.from_dict({**grasp.to_dict(), **given})
 
 
 def simulate(model: Model, grasp: GraspObject | None, *, dt: float = 0.25e-3) -> Closure:
@@ -94,7 +96,7 @@ def logged(run: Rollout, period: float, start: float = PERIOD) -> Closure:
     )
 
 
-def figures(closure: Closure) -> dict[str, float]:
+def figures(closure: Closure, window: float = SLOPE_WINDOW) -> dict[str, float]:
     """The figures of the module's docstring that this closure has; NaN where a phase is missing."""
     t, i = closure.time, closure.current
     out = {"plateau": float(i[(t >= 0.4) & (t <= TOP)].mean())}
@@ -114,9 +116,9 @@ def figures(closure: Closure) -> dict[str, float]:
     if gripped:
         after = (t >= void_end - 0.1) & rise
         out["maximum"] = float(i[top])
-        out["slope_closing"] = float(slopes(t[after], i[after]).max())
-    falling = (t >= TOP - SLOPE_WINDOW) & (t <= least)
-    out["slope_opening"] = float(slopes(t[falling], i[falling]).min())
+        out["slope_closing"] = float(slopes(t[after], i[after], window).max())
+    falling = (t >= TOP - window) & (t <= least)
+    out["slope_opening"] = float(slopes(t[falling], i[falling], window).min())
     out["force"] = float(closure.force.max())
     return out
 

@@ -168,8 +168,9 @@ def simulated_drop_times(
     for k in range(steps + 1):
         log[k] = d.qpos[columns]
         mujoco.mj_step(m, d)
-    time = np.arange(steps + 1) * dt
-    out, angles = {}, {"time": time}
+    time: Array = np.arange(steps + 1, dtype=np.float64) * dt
+    out: dict[str, tuple[float, float]] = {}
+    angles: dict[str, Array] = {"time": time}
     for n, finger in enumerate(START_DEG):
         q = log[:, 2 * n : 2 * n + 2]
         angles[finger] = q

@@ -66,7 +66,7 @@ def currents(curves: Mapping[str, Any]) -> Picture:
                 lw=1,
                 label=f"real hand, {name.replace('_', ' ')} {REAL[kind][name]:g} A",
             )
-        top.set(title=f"{kind} object", ylabel="current / A", ylim=(0, None))
+        top.set(title=f"{kind} object", ylabel="current / A", ylim=(0, 1.35 * REAL[kind]["maximum"]))
         top.legend(fontsize=7, loc="upper right")
         middle.plot(c.time, c.reference, color=COLOURS["reference"], label="reference")
         middle.plot(c.time, c.encoder, color=COLOURS["encoder"], label="encoder")

@@ -41,12 +41,12 @@ class Figure:
     @property
     def thesis_error(self) -> float:
         """Relative error of the thesis' model, percent (P22: (desired - model) / desired x 100)."""
-        return _relative(self.desired, self.thesis)
+        return _relative(self.desired, self.thesis) if self.kind == "value" else math.nan
 
     @property
     def error(self) -> float:
         """Relative error of this model, percent."""
-        return _relative(self.desired, self.ours)
+        return _relative(self.desired, self.ours) if self.kind == "value" else math.nan
 
     @property
     def closer(self) -> bool | None:
@@ -158,7 +158,7 @@ def cells(figure: Figure) -> tuple[str, ...]:
         number(figure.thesis),
         percent(figure.thesis_error),
         number(figure.ours),
-        percent(figure.error) if figure.kind == "value" else "-",
+        percent(figure.error),
         closer,
         target(figure),
         verdict(figure),

@@ -62,8 +62,8 @@ FLOOR = 0.01
 ITERATIONS = 14
 
 DURATION = 2.0
-"""s of the closure that are compared: the reference's rise and fall.  After it the motor overshoots the open hand; wires
-go slack, the forces transmission pushes, and no parameter of it can help that."""
+"""s of the closure that are compared: the reference's rise and fall.  After it the motor overshoots the open hand:
+wires go slack, the forces transmission pushes, and no parameter of it can help that."""
 
 _COLUMNS = [JOINT_NAMES.index(joint) for joint in FLEXED]
 
@@ -198,14 +198,13 @@ def run(model: Model, which: str, progress: Progress = silent) -> Section:
             figures.append(
                 Figure(
                     row,
-                    f"{joint}, RMSE, at most half the thesis' {given[joint]:g} or {FLOOR:g}",
+                    f"{joint}, RMSE",
                     "rad",
                     max(FLOOR, 0.5 * given[joint]),
                     given[joint],
                     float(after[k]),
                     kind="at_most",
                     role="fitted",
-                    note=f"before the identification {before[k]:.4f}",
                 )
             )
     what = (
@@ -214,17 +213,22 @@ def run(model: Model, which: str, progress: Progress = silent) -> Section:
         else "forces on the joints (an arm per joint; preload, rate and dry friction per digit: 24 numbers)"
     )
     names = ("return wires", "torsion springs") if which == "springs" else ("pulleys and wires", "forces")
-    notes = (
-        f"{what} identified by least squares from the full hand's own angles over one void closure, closing and "
-        f"opening ({DURATION:g} s; after it the motor overshoots the open hand, wires go slack and forces push).",
-    )
     time = 0.004 * np.arange(wanted.shape[0])
     title = f"{names[0]} against {names[1]}"
+    still = [j for k, j in enumerate(FLEXED) if np.ptp(wanted[:, k]) < math.radians(1.0)]
+    notes = [
+        f"{what} identified by least squares from the full hand's own angles over one void closure, closing and "
+        f"opening ({DURATION:g} s; after it the motor overshoots the open hand, wires go slack and forces push). "
+        "Root mean square over all joints before the identification "
+        f"{math.sqrt(float((before**2).mean())):.4f} rad, after it {math.sqrt(float((after**2).mean())):.4f} rad."
+    ]
+    if still:
+        notes.append(f"{', '.join(still)} turns less than 1 deg in this closure; its RMSE says nothing.")
     return Section(
         (row,),
         title,
         tuple(figures),
-        notes,
+        tuple(notes),
         {
             "time": time,
             "full": wanted,
