@@ -79,7 +79,7 @@ def signature(name: str, model: Model | None = None) -> Signature:
     found = []
     for condition in SHOWN:
         nominal, changed = (_closure(m, condition, closures) for m in (model, model.with_effect(entry)))
-        time = np.arange(nominal["motor_current"].size) * 1e-3
+        time: Array = np.arange(nominal["motor_current"].size, dtype=np.float64) * 1e-3
         found.append(Signature(effect, condition, time, nominal, changed, closures, entry.values))
     return max(found, key=lambda s: s.size)
 
@@ -94,7 +94,7 @@ def _closure(model: Model, condition: str, closures: int) -> dict[str, Array]:
     rollout(plant, controller, np.zeros(500), joints=False)
     for _ in range(closures):
         run = rollout(plant, controller, one, reset=False, joints=False)
-    return {name: run.signal(name).copy() for name in WORTH}
+    return {name: np.array(run.signal(name), dtype=np.float64) for name in WORTH}
 
 
 def draw(found: Signature, path: Path) -> Path:

@@ -1,0 +1,148 @@
+"""The README as a new user has it: its commands run, its own-effect example works as pasted, its tables are current."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = ("README.md", "CHANGELOG.md", "docs/decisions.md", "docs/effects.md")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of README.md: the word of the comment above it (`tested: quick`, `file: NAME`), and its text."""
+
+    mark: str
+    text: str
+
+
+def blocks(kind: str) -> list[Block]:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    found = re.findall(r"<!-- (\w+): (\S+) -->\n```\w*\n(.*?)```", text, re.DOTALL)
+    return [Block(mark, body) for name, mark, body in found if name == kind]
+
+
+@pytest.fixture
+def user(tmp_path: Path) -> Path:
+    """A folder with what the README's commands find beside them: the recorded closures and the saved example."""
+    shutil.copytree(ROOT / "bags", tmp_path / "bags")
+    for block in blocks("file"):
+        (tmp_path / block.mark).write_text(block.text, encoding="utf-8")
+    return tmp_path
+
+
+def run(text: str, folder: Path, timeout: float = 250.0) -> str:
+    """The block in a shell in which `hannes` is this environment's; it stops at the first command that fails."""
+    script = f'hannes() {{ "{sys.executable}" -m hannes_bringup.cli "$@"; }}\nset -e\n{text}'
+    answer = subprocess.run(
+        ["bash", "-c", script],
+        cwd=folder,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        stdin=subprocess.DEVNULL,
+    )
+    assert answer.returncode == 0, f"{text}\n{answer.stdout[-2000:]}\n{answer.stderr[-2000:]}"
+    return answer.stdout
+
+
+def marked(mark: str) -> list[Block]:
+    found = [block for block in blocks("tested") if block.mark == mark]
+    assert found, f"README.md has no block marked {mark}"
+    return found
+
+
+def test_the_tour_has_what_is_tested_here() -> None:
+    assert {block.mark for block in blocks("tested")} == {"quick", "slow", "ros"}
+    assert [block.mark for block in blocks("file")] == ["my_effect.py"]
+
+
+@pytest.mark.parametrize("number", range(len([b for b in blocks("tested") if b.mark == "quick"])))
+def test_quick_commands(number: int, user: Path) -> None:
+    assert run(marked("quick")[number].text, user)
+
+
+def test_the_example_is_as_short_as_it_says() -> None:
+    lines = [line for line in blocks("file")[0].text.splitlines() if line.strip()]
+    assert len(lines) <= 20
+
+
+def test_own_effect_works_as_pasted(user: Path) -> None:
+    """Hidden, found by name, added; the error falls to the repeatability. Few candidates, so that it is quick."""
+    own = next(block.text for block in marked("slow") if "my_effect.py" in block.text)
+    quick = own.replace(
+        "hannes diagnose lab/worn", "hannes diagnose lab/worn --only viscous_friction --jobs 1"
+    )
+    printed = run(quick, user)
+    assert "Missing: worn spot." in printed
+    rows = re.findall(r"\+ worn_spot\s+│\s+([\d.]+)\s+│\s+([\d.]+)", printed)
+    assert len(rows) == 2  # of diagnose and of add
+    assert all(float(held_out) < 1.3 for _, held_out in rows), printed
+    assert "my_effect.py:WornSpot" in (user / "lab" / "worn_hand.yaml").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_hidden_effect_is_found_as_printed(user: Path) -> None:
+    find, add = (b.text for b in marked("slow") if "my_effect.py" not in b.text)
+    printed = run(find + add, user)
+    expected = re.search(r"EFFECTS  Missing: ([^.]+)\.", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert expected and f"Missing: {expected[1]}." in " ".join(printed.split())
+    assert (user / "lab" / "report.html").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.ros
+def test_graph_with_the_found_model(user: Path, ros_environment: dict[str, str]) -> None:
+    run("hannes hide lab/hidden --truth lab/truth.yaml --effect load_dependent_friction --seed 7 --closures 5\n"
+        "hannes add lab/hidden --effect load_dependent_friction --out lab/my_hand.yaml", user)  # fmt: skip
+    printed = run("".join(block.text for block in marked("ros")), user)
+    assert "/hannes/motor/state" in printed
+
+
+def test_tables_are_current() -> None:
+    answer = subprocess.run(
+        [sys.executable, str(ROOT / "tools" / "readme_tables.py"), "--check"], capture_output=True, text=True
+    )
+    assert answer.returncode == 0, "run `python tools/readme_tables.py`\n" + answer.stderr
+
+
+def test_effects_page_has_every_effect_with_its_picture() -> None:
+    from hannes_lab.effects_page import describe
+    from hannes_sim.effect import catalogue
+
+    page = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## .+\n\n`(\w+)`", page, re.MULTILINE) == list(catalogue())
+    for name, effect in catalogue().items():
+        assert f"figures/effects/{name}.svg" in page
+        for p in describe(effect)["parameters"]:
+            row = f"| `{p['name']}` | {p['unit']} | {p['lower']:g} .. {p['upper']:g} | {p['typical']:g} |"
+            assert row in page, f"{name}.{p['name']}: run `hannes model effects --page docs/effects.md`"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page: str) -> None:
+    path = ROOT / page
+    text = path.read_text(encoding="utf-8")
+    targets = [
+        t.split("#")[0] for t in re.findall(r"\]\(([^)\s]+)\)", text) if not t.startswith(("http", "#"))
+    ]
+    assert not [target for target in targets if not (path.parent / target).exists()]
+
+
+def test_commands_named_in_the_readme_exist() -> None:
+    from hannes_bringup.cli import COMMANDS
+
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    code = "\n".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL) + re.findall(r"`([^`\n]+)`", text))
+    named = set(re.findall(r"^(?:time )?hannes (\w+)|(?<=[;&`\n] )hannes (\w+)", code, re.MULTILINE))
+    assert {a or b for a, b in named} <= {command.name for command in COMMANDS}
+    assert (ROOT / "docs" / "figures" / "overview.png").stat().st_size < 400_000
