@@ -17,6 +17,8 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache as cache_once
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Protocol, cast
 
@@ -49,6 +51,17 @@ UNIDENTIFIED = 0.7
 
 CONFOUNDED = 0.95
 """Correlation of two parameters' posterior, priors aside, above which they cannot be told apart."""
+
+LAB_SOURCES = (
+    "features.py",
+    "trials.py",
+    "problem.py",
+    "hand.py",
+    "currents.py",
+    "least_force.py",
+    "fitting.py",
+)
+"""Files of the lab that stand between a simulation and its residual."""
 
 SPREAD = 0.5
 """Scatter of the further starts, in prior standard deviations."""
@@ -116,7 +129,7 @@ class TargetProblem:
             found = self.predict(model, values)
         except PlantDiverged:
             return np.full(len(self.targets), FAILED)
-        out = np.array([(t.value - found[t.name]) / t.sd for t in self.targets])
+        out = np.array([(t.value - found.get(t.name, math.nan)) / t.sd for t in self.targets])
         return np.where(np.isfinite(out), out, 30.0)
 
 
@@ -148,7 +161,12 @@ class Remembered:
             self._progress(self.done, max(self.total, self.done), self.text)
         if self.folder is None:
             return np.asarray(self.problem.residual(model, values), dtype=np.float64)
-        text = self.key + model.sha256 + json.dumps(sorted((k, float(v)) for k, v in values.items()))
+        text = (
+            code_digest()
+            + self.key
+            + model.sha256
+            + json.dumps(sorted((k, float(v)) for k, v in values.items()))
+        )
         path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()}.npy"
         if path.exists():
             try:
@@ -164,6 +182,19 @@ class Remembered:
             np.save(file, out, allow_pickle=False)
         part.replace(path)
         return out
+
+
+@cache_once
+def code_digest() -> str:
+    """Hash of the sources that a simulation depends on: a changed simulator finds no old results."""
+    found = hashlib.sha256()
+    for package in ("hannes_description", "hannes_control", "hannes_sim", "hannes_lab"):
+        spec = find_spec(package)
+        for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
+            for path in sorted(Path(folder).rglob("*.py")):
+                if package != "hannes_lab" or path.name in LAB_SOURCES:
+                    found.update(path.name.encode() + path.read_bytes())
+    return found.hexdigest()
 
 
 def default_cache() -> Path:
@@ -430,7 +461,7 @@ def calibrate_targets(
         _agree(costs),
         {},
         tuple(notes),
-        problem.simulations,
+        remembered.done - remembered.hits,
         remembered.hits,
         found[0],
     )
@@ -509,6 +540,7 @@ def calibrate(
         },
     )
     notes = warnings_of(parameters, len(free), features.size)
+    notes.append("What is not free is taken as exact; the intervals do not hold its uncertainty.")
     costs = tuple(f.cost for f in found)
     if starts > 1 and _agree(costs) == 1:
         notes.append("Only one start reached the best point; try more --starts.")
@@ -519,7 +551,7 @@ def calibrate(
         _agree(costs),
         errors,
         (*notes, *prepared.notes),
-        problem.simulations,
+        remembered.done - remembered.hits,
         remembered.hits,
         best,
     )

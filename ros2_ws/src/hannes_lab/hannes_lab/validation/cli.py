@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 import shlex
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,9 +14,11 @@ import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.parameters import data_path
+from rich.console import Console
+from rich.table import Table
 
 from ..calibrate import default_cache
-from ..cli import _console, _finite, _Progress
+from ..cli import _finite, _Progress
 from . import columns, convergence, double_pendulum, fitting, least_force, pictures, runtime, variants
 from .table import HEADINGS, Progress, Section, cells, markdown
 
@@ -184,9 +187,7 @@ def validate(
 
 
 def _show(sections: list[Section], rows: list[str] | None) -> None:
-    from rich.table import Table
-
-    console = _console()
+    console = Console(width=None if sys.stdout.isatty() else 220, highlight=False)
     for section in sections:
         table = Table(title=section.title, title_justify="left", box=None, pad_edge=False)
         for k, name in enumerate(HEADINGS):
