@@ -133,9 +133,18 @@ def slopes(time: Array, values: Array, window: float = SLOPE_WINDOW) -> Array:
 
 
 def closure_time(
-    model: Model, current: float = PLATEAU_CURRENT, *, dt: float = 0.25e-3, limit: float = 4.0
+    model: Model,
+    current: float = PLATEAU_CURRENT,
+    *,
+    dt: float = 0.25e-3,
+    limit: float = 4.0,
+    extrapolate: bool = False,
 ) -> float:
-    """s until the encoder has made 40000 counts with a constant motor current from rest; NaN if it does not."""
+    """s until the encoder has made 40000 counts with a constant motor current from rest.
+
+    A hand that does not within `limit` gives NaN, or with `extrapolate` the limit lengthened by what is missing, which
+    leads a search back to hands that close.
+    """
     plant = make_plant(model, None, dt=dt)
     gains = replace(
         DoublePIDParameters.from_parameters(model.parameters),
@@ -147,7 +156,7 @@ def closure_time(
     run = rollout(plant, DoublePID(gains), np.full(round(limit / 1e-3), 1e3), joints=False)
     q = run.encoder_position
     if q.max() < FULL_CLOSURE:
-        return math.nan
+        return limit * (2.0 - float(q.max()) / FULL_CLOSURE) if extrapolate else math.nan
     k = int(np.argmax(q >= FULL_CLOSURE))
     return float(np.interp(FULL_CLOSURE, q[k - 1 : k + 1], run.time[k - 1 : k + 1]))
 
