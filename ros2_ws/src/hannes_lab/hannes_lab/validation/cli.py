@@ -136,7 +136,7 @@ def validate(
     motor: Annotated[
         str, typer.Option(help="Motor of --calibrate: " + ", ".join(fitting.MOTORS) + ".")
     ] = "2642W012CR",
-    starts: Annotated[int, typer.Option(min=1, help="Starts of --calibrate.")] = 2,
+    starts: Annotated[int, typer.Option(min=1, help="Starts of --calibrate.")] = 3,
     model_out: Annotated[
         Path | None, typer.Option("--model-out", help="Where --calibrate writes the model file.")
     ] = None,

@@ -146,7 +146,7 @@ def predict(model: Model, values: Mapping[str, float]) -> Mapping[str, float]:
 def calibrate_thesis(
     *,
     motor: str = "2642W012CR",
-    starts: int = 2,
+    starts: int = 3,
     seed: int = 0,
     evaluations: int = 12,
     cache: Path | None = None,
