@@ -248,7 +248,8 @@ def _notes(model: Model, nominal: Mapping[str, Closure]) -> tuple[str, ...]:
         f"with it but a stiff wire of {STIFF_WIRE / 1e3:g} kN/m: {pair(stiff)}. The wire's "
         f"{v('wires.master_stiffness') / 1e3:.1f} kN/m stand for all that gives way: wires, pulleys, pads, glove.",
         "What falls short: R12 of the soft column is too fast by the same friction, which holds the pulley there "
-        "too; the real hand presumably gives way with the object. R11 of the soft column is too low. A relaxation of object "
+        "too; the real hand presumably gives way with the object. R11 of the soft column is too low. "
+        "A relaxation of object "
         "and glove, or a friction that depends on more than the wire's tension, would be the next to try; the "
         "thesis' figures alone cannot identify it.",
         f"At the pulley {torque:.3f} N.m per A drive; {torque / (1.0 + mu):.3f} N.m per A arrive at the wire. "
@@ -261,8 +262,11 @@ def _notes(model: Model, nominal: Mapping[str, Closure]) -> tuple[str, ...]:
         "The calibrated hand is judged; the population's closures through the thesis' sensors are in the remarks.",
         f"Motor {model.provenance.get('motor', 'as in the model')}. The other named option is the 2342S012CR (model "
         f"thesis_hand_2342): its calibration ends at a cost of {other.provenance['cost']:.0f} against "
-        f"{model.provenance.get('cost', math.nan):.0f}, from one start, so it may not be the best. Currents alone do not "
-        "tell them apart; R12 with R13 speaks for the 2642, because the other has too little torque left at R10 for the "
-        f"force beside the friction that R12 asks for. The voltage at the stalled grip of R10 would decide: {volts}; so "
+        f"{model.provenance.get('cost', math.nan):.0f}, from one start, so it may not be the best. "
+        "Currents alone do not "
+        "tell them apart; R12 with R13 speaks for the 2642, because the other has too little torque "
+        "left at R10 for the "
+        "force beside the friction that R12 asks for. The voltage at the stalled grip of R10 would "
+        f"decide: {volts}; so "
         "would the free speed at a given voltage, or the motor's label.",
     )
