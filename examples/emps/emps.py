@@ -17,6 +17,7 @@ from hannes_sim.native import CONTROL_SIGNATURE
 from hannes_sim.rollout import Rollout
 from numba import cfunc
 from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
 
 HERE = Path(__file__).parent
 FIELDS = ("t", "qg", "qm", "vir", "gtau")
@@ -34,7 +35,7 @@ COMPILED = cfunc(CONTROL_SIGNATURE)(control)
 
 
 class Ppd:
-    """The controller of the bench."""
+    """The bench's controller."""
 
     def __init__(self, parameters, period):
         self.address, self.period = COMPILED.address, period
@@ -69,10 +70,8 @@ class Emps(PlantRig):
     }
 
     def logged(self, run: Rollout, trial: Trial) -> dict[str, np.ndarray]:
-        return {
-            "encoder_position": run.encoder_position,
-            "drive_force": trial.options["gtau"] * run.motor_voltage,
-        }
+        force = trial.options["gtau"] * run.motor_voltage
+        return {"encoder_position": run.encoder_position, "drive_force": force}
 
     @classmethod
     def read(cls, paths: Sequence[Path]) -> list[Trial]:
@@ -85,19 +84,16 @@ class Emps(PlantRig):
         try:
             data = loadmat(path)
             t, reference, position, voltage, gtau = (np.asarray(data[n], float).ravel() for n in FIELDS)
-        except (KeyError, ValueError, OSError) as error:
+        except (KeyError, IndexError, ValueError, OSError, MatReadError) as error:
             raise HannesError(
                 f"'{path}' is no recording of EMPS with {', '.join(FIELDS)}: {error}."
             ) from error
         period = round(float(np.median(np.diff(t))), 6)
         grid = np.arange(t.size) * period
         at = [round(1e3 * float(r)) for r in reference]
-        closures = [
-            Closure(a, b, f"{at[round(a / period)]} to {at[round(b / period)]} mm")
-            for a, b in find_moves(reference, period)
-        ]
+        moves = [(a, b, at[round(a / period)], at[round(b / period)]) for a, b in find_moves(reference, period)]
+        closures = [Closure(a, b, f"{start} to {stop} mm") for a, b, start, stop in moves]
         signals = {"drive_force": (grid, float(gtau[0]) * voltage), "encoder_position": (grid, position)}
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        units = {"drive_force": "N", "encoder_position": "m"}
         return Trial("emps", period, reference, signals, tuple(closures), {"gtau": float(gtau[0])}, str(path),
-                     digest, units=units)  # fmt: skip
+                     hashlib.sha256(path.read_bytes()).hexdigest(),
+                     units={"drive_force": "N", "encoder_position": "m"})  # fmt: skip

@@ -18,14 +18,13 @@ Array = NDArray[np.float64]
 CHANCE = 1e-3
 """Chance that a line stands out in a residual without one."""
 
-COLOUR = 1.5
-"""Factor on what white noise reaches: residuals are smooth, so that their spectra are uneven."""
-
 SURROUNDINGS = 300
 """Frequencies on each side of a line with which it is compared."""
 
 
-def position_periods(problem: Problem, fit: Fit, lower: float, upper: float, keep: int = 2) -> tuple[float, ...]:
+def position_periods(
+    problem: Problem, fit: Fit, lower: float, upper: float, keep: int = 2
+) -> tuple[float, ...]:
     """Up to `keep` periods between lower and upper [unit of the position] that stand out, strongest first.
 
     Empty where no position is recorded or nothing stands out.
@@ -35,8 +34,12 @@ def position_periods(problem: Problem, fit: Fit, lower: float, upper: float, kee
     places = {b.condition: b for b in features.blocks if b.signal == "encoder_position"}
     curves: list[tuple[Array, Array]] = []
     spans: dict[str, float] = {}
+    # A force shows the ripple itself; the position shows its double integral, in which slow errors hide it.
+    drive = [
+        signal for signal in problem.rig.drive_signals if any(b.signal == signal for b in features.blocks)
+    ]
     for block, model in zip(features.blocks, predicted, strict=True):
-        if block.condition in places:
+        if block.condition in places and (not drive or block.signal == drive[0]):
             place = places[block.condition]
             x = np.interp(block.phase, place.phase, place.measured.mean(axis=0))
             curves.append((x, (block.measured - model).mean(axis=0)))
@@ -56,9 +59,9 @@ def position_periods(problem: Problem, fit: Fit, lower: float, upper: float, kee
     for (x, r), step in zip(curves, steps, strict=True):
         # Long moves resolve a line, short ones smear it.
         power += float(np.ptp(x)) * _periodogram(x, r, frequency) * (frequency < 1.0 / (2.2 * step))
-    # Sum of n exponentials (the powers of white noise in n conditions); signals of one condition tell the same.
+    # The powers of white noise in n conditions are exponentials; their sum is a gamma variable.
     n = sum(spans.values()) ** 2 / sum(s * s for s in spans.values())
-    stands_out = COLOUR * float(gamma.isf(CHANCE / frequency.size, n) / gamma.median(n))
+    stands_out = float(gamma.isf(CHANCE / frequency.size, n) / gamma.median(n))
     ratio = np.array(
         [
             power[k] / max(float(np.median(power[max(0, k - SURROUNDINGS) : k + SURROUNDINGS + 1])), 1e-300)

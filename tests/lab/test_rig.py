@@ -1,0 +1,155 @@
+"""The lab on another machine: an adapter outside the packages, a mass in the loop of its own controller."""
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hannes_bringup.cli import main
+from hannes_description.errors import HannesError
+from hannes_description.model import Model
+from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.rig import linear_unit, load_rig, scaled_effect, unit_factor
+from hannes_lab.screen import usable_effects
+from hannes_lab.spectrum import position_periods
+from hannes_lab.trials import find_moves
+from hannes_sim.effect import catalogue, load_effect
+from hannes_sim.rollout import rollout
+from lab.single_mass_rig import reference, write_files
+
+ADAPTER = f"{Path(__file__).parent / 'single_mass_rig.py'}:SingleMass"
+CONSIDERED = [
+    "coulomb_friction",
+    "stribeck_friction",
+    "cogging",
+    "direction_dependent_friction",
+    "command_delay",
+]
+PERIOD = 2.5e-3  # m, of the hidden ripple
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mass of 2.1 kg with dry friction and a ripple of 2.5 mm, recorded with noise."""
+    folder = tmp_path_factory.mktemp("mass")
+    write_files(folder)
+    rig = load_rig(ADAPTER)
+    model = Model.load(folder / "mass.yaml").with_values({"motor.armature": 2.1, "friction.viscous": 5.0})
+    sizes = tuple(sorted(rig.sizes.items()))
+    model = model.with_effect(
+        scaled_effect(load_effect("coulomb_friction"), sizes, True).entry({"level": 1.2})
+    )
+    ripple = {"sine": 0.3, "cosine": 0.2, "period": PERIOD}
+    model = model.with_effect(scaled_effect(load_effect("cogging"), sizes, True).entry(ripple))
+    machine = rig([])
+    run = rollout(machine.plant(model, None), machine.controller(model, 1e-3), reference())
+    rng = np.random.default_rng(3)
+    path = folder / "mass.npz"
+    position = run.encoder_position + 2e-7 * rng.standard_normal(run.time.size)
+    force = run.motor_voltage + 0.02 * rng.standard_normal(run.time.size)
+    np.savez(path, reference=run.reference_position, position=position, force=force)
+    return path
+
+
+@pytest.fixture(scope="module")
+def prepared(recording: Path) -> Prepared:
+    rig = load_rig(ADAPTER)
+    return prepare(rig.read([recording]), Model.load(recording.parent / "mass.yaml"), rig=rig)
+
+
+def test_moves_are_the_stretches_between_standstills() -> None:
+    spans = find_moves(reference(2), 1e-3)
+    assert len(spans) == 10
+    assert [round(b - a, 1) for a, b in spans[:4]] == [0.4, 0.5, 0.6, 0.4]
+
+
+def test_effects_without_a_meaning_are_not_offered(prepared: Prepared) -> None:
+    usable = usable_effects(prepared, effect_sources(model=prepared.model))
+    assert {"coulomb_friction", "cogging", "presliding_friction"} <= set(usable.sources)
+    assert not {"wire_slack", "wire_elasticity", "object_damping", "current_sensor", "gravity"} & set(
+        usable.sources
+    )
+    assert any("gravity" in note and "horizontal" in note for note in usable.notes)
+    assert any("wire_slack" in note and "move none" in note for note in usable.notes)
+
+
+def test_a_ripple_is_seen_in_the_spectrum_over_the_position(prepared: Prepared) -> None:
+    from hannes_lab.search import Search
+
+    search = Search(
+        prepared.problem, prepared.model, prepared.nuisances, {"coulomb_friction": "coulomb_friction"}
+    )
+    best = search.add(search.null(), "coulomb_friction")
+    periods = position_periods(prepared.problem, best.fit, 1e-3, 0.1)
+    assert periods and periods[0] == pytest.approx(PERIOD, rel=0.02)
+
+
+def test_greedy_search_finds_friction_and_ripple_and_stops(prepared: Prepared) -> None:
+    found = diagnose(prepared, effect_sources(only=CONSIDERED), greedy=True, max_effects=6)
+    assert found.verdict == "effects"
+    assert [e.name for e in found.effects] == ["coulomb_friction", "cogging"]
+    friction, ripple = (e.parameters for e in found.effects)
+    assert friction["level"].value == pytest.approx(1.2, rel=0.02) and friction["level"].unit == "N"
+    assert ripple["period"].value == pytest.approx(PERIOD, rel=2e-3) and ripple["period"].unit == "m"
+    assert found.model.parameters.value("motor.armature") == pytest.approx(2.1, rel=0.005)
+    falls = [f.held_out_signals["drive_force"] for f in found.falls[1:]]
+    assert falls == sorted(falls, reverse=True) and falls[-1] < 0.03
+    assert any("stops here" in note for note in found.notes)
+
+
+def test_greedy_search_is_the_same_in_two_processes(prepared: Prepared) -> None:
+    """A rig from a user's file travels to the workers."""
+    only = ["coulomb_friction", "viscous_friction", "command_delay"]
+    one, two = (
+        diagnose(prepared, effect_sources(only=only), greedy=True, max_effects=1, jobs=jobs)
+        for jobs in (1, 2)
+    )
+    assert one.values == two.values
+    again = pickle.loads(pickle.dumps(prepared.rig))
+    assert type(again).__name__ == "SingleMass" and again.trials[0].name == "mass"
+
+
+def test_commands_take_the_adapter(
+    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = str(recording.parent / "mass.yaml")
+    words = ["compare", str(recording), "--rig", ADAPTER, "--model", model, "--fitted", "--json"]
+    monkeypatch.setattr("sys.argv", ["hannes", *words])
+    try:
+        assert not main()
+    except SystemExit as end:
+        assert not end.code
+    content = json.loads(capsys.readouterr().out)
+    assert {e["unit"] for e in content["errors"]} == {"m", "N"}
+    assert content["metrics"] == []
+
+
+def test_broken_adapters_are_clear_errors(tmp_path: Path) -> None:
+    with pytest.raises(HannesError, match=r"path\.py:Class"):
+        load_rig("single_mass")
+    file = tmp_path / "mine.py"
+    file.write_text("class Mine:\n    pass\n")
+    with pytest.raises(HannesError, match="not a subclass"):
+        load_rig(f"{file}:Mine")
+    with pytest.raises(HannesError, match="No file"):
+        load_rig(ADAPTER).read([tmp_path / "none.npz"])
+
+
+def test_units_scale_by_dimension() -> None:
+    sizes = {"N.m": 0.5, "rad": 1.457}  # ten times the torque over a tenth of the travel
+    assert unit_factor("N.m", sizes) == pytest.approx(10.0)
+    assert unit_factor("N.m.s/rad", sizes) == pytest.approx(100.0)
+    assert unit_factor("rad/(N.m)", sizes) == pytest.approx(0.01)
+    assert unit_factor("N.m/rad3", sizes) == pytest.approx(1e4)
+    assert unit_factor("kg.m2", sizes) == pytest.approx(100.0)
+    assert unit_factor("s", sizes) == unit_factor("1", sizes) == 1.0
+    assert (
+        linear_unit("N.m.s/rad") == "N.s/m"
+        and linear_unit("rad/(N.m)") == "m/N"
+        and linear_unit("kg.m2") == "kg"
+    )
+    for effect in catalogue().values():
+        for p in scaled_effect(effect, tuple(sorted(sizes.items())), False).parameters:
+            assert p.lower <= p.typical <= p.upper, f"{effect.name}.{p.name}"
