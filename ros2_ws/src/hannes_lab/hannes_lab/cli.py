@@ -23,9 +23,10 @@ from rich.table import Table
 from .add import Addition, add_effects, with_provenance
 from .compare import Comparison
 from .compare import compare as compare_model
-from .diagnose import Diagnosis, effect_sources
+from .diagnose import MAX_EFFECTS, Diagnosis, effect_sources
 from .diagnose import diagnose as diagnose_model
 from .prepare import Prepared, load_trials, prepare
+from .rig import load_rig
 
 Bags = Annotated[list[Path], typer.Argument(help="Bags, or folders of bags; one bag may hold many closures.")]
 ModelFile = Annotated[str, typer.Option("--model", help="Model file, or the name of a shipped model.")]
@@ -37,6 +38,19 @@ Objects = Annotated[
     list[str] | None,
     typer.Option(
         "--object", help="What a condition holds, as CONDITION=none|soft|rigid; overrides the bag's metadata."
+    ),
+]
+RigFile = Annotated[
+    str | None,
+    typer.Option("--rig", help="Another machine's adapter, as path.py:Class; BAGS are then the files that it reads."),
+]
+MaxEffects = Annotated[int, typer.Option("--max-effects", min=1, help="Most effects that a diagnosis may name.")]
+Greedy = Annotated[
+    bool,
+    typer.Option(
+        "--greedy",
+        help="Add effects one after another while the error on held-out conditions falls by 5 %: many small effects "
+        "of a real machine.",
     ),
 ]
 Signals = Annotated[list[str] | None, typer.Option("--signal", help="Compare only these signals.")]
@@ -85,15 +99,22 @@ class _Progress:
 
 
 def _prepared(
-    bags: Sequence[Path], model: str, objects: Sequence[str] | None, signals: Sequence[str] | None
+    bags: Sequence[Path],
+    model: str,
+    objects: Sequence[str] | None,
+    signals: Sequence[str] | None,
+    rig: str | None = None,
 ) -> Prepared:
+    machine = load_rig(rig) if rig else None
+    if machine is not None and model == "nominal":
+        model = str(machine.model)
     given = {}
     for text in objects or ():
         name, _, what = text.partition("=")
         if not what:
             raise HannesError(f"--object {text}: give CONDITION=none|soft|rigid.")
         given[name] = what
-    trials = load_trials(bags)
+    trials = machine.read(bags) if machine else load_trials(bags)
     unknown = sorted(set(given) - {t.name for t in trials})
     if unknown:
         raise HannesError(
@@ -103,7 +124,7 @@ def _prepared(
     trials = [
         replace(t, options={**t.options, "object": given[t.name]}) if t.name in given else t for t in trials
     ]
-    return prepare(trials, Model.load(model), signals=signals)
+    return prepare(trials, Model.load(model), rig=machine, signals=signals, surrogate=True)
 
 
 def _print_json(content: dict[str, Any]) -> None:
@@ -141,11 +162,12 @@ def compare(
     ] = False,
     objects: Objects = None,
     signals: Signals = None,
+    rig: RigFile = None,
     report: ReportFile = None,
     json: Json = False,
 ) -> None:
     """Compare the model with recorded closures: where does it fail, and by how much?"""
-    prepared = _prepared(bags, model, objects, signals)
+    prepared = _prepared(bags, model, objects, signals, rig)
     result = compare_model(prepared, fitted=fitted)
     if report:
         _write_report(report, comparison=result, after=None, diagnosis=None)
@@ -173,8 +195,8 @@ def _show_comparison(result: Comparison) -> None:
             "fails" if c.fails else "",
         )
     console.print(table)
-    table = Table(title="Figures of the thesis")
-    for name in ("condition", "figure", "measured", "sd", "model", "relative error"):
+    table = Table(title="Figures of the thesis") if result.metrics else Table(show_header=False, show_edge=False)
+    for name in ("condition", "figure", "measured", "sd", "model", "relative error") if result.metrics else ():
         table.add_column(name, justify="left" if name in ("condition", "figure") else "right")
     for m in result.metrics:
         table.add_row(
@@ -204,18 +226,23 @@ def diagnose(
     out: Annotated[Path, typer.Option("--out", help="Model file that --add writes.")] = Path("my_hand.yaml"),
     objects: Objects = None,
     signals: Signals = None,
+    rig: RigFile = None,
+    max_effects: MaxEffects = MAX_EFFECTS,
+    greedy: Greedy = False,
     jobs: Jobs = _JOBS,
     report: ReportFile = None,
     json: Json = False,
 ) -> None:
     """Which physical effect does the model lack: nothing, effects of the catalogue, or something unknown?"""
-    prepared = _prepared(bags, model, objects, signals)
+    prepared = _prepared(bags, model, objects, signals, rig)
     with _Progress(quiet=json) as progress:
         found = diagnose_model(
             prepared,
             effect_sources(effects or (), only=only, model=prepared.model),
             jobs=jobs,
             progress=progress,
+            max_effects=max_effects,
+            greedy=greedy,
         )
     written = None
     if add:
@@ -273,7 +300,10 @@ def _show_falls(console: Console, found: Diagnosis | Addition) -> None:
     table = Table(
         title="Error, in multiples of the repeatability between closures (1 = as good as the hand repeats)"
     )
-    for name in ("model", "training closures", "held-out closures", "held-out conditions"):
+    units = {s.signal: s.unit for fall in found.falls for s in fall.signals}
+    signals = list(found.falls[-1].held_out_signals)
+    columns = ("model", "training closures", "held-out closures", "held-out conditions")
+    for name in (*columns, *(f"{s}, {units.get(s, '')}" for s in signals)):
         table.add_column(name, justify="left" if name in ("model", "held-out conditions") else "right")
     for k, fall in enumerate(found.falls):
         conditions = ", ".join(f"{c} {_number(v, 3)}" for c, v in fall.by_condition.items())
@@ -282,8 +312,11 @@ def _show_falls(console: Console, found: Diagnosis | Addition) -> None:
             _number(fall.train, 3),
             _number(fall.held_out, 3),
             conditions,
+            *(_number(fall.held_out_signals.get(s, math.nan), 3) for s in signals),
         )
     console.print(table)
+    if signals:
+        console.print("The last columns: error of each signal on held-out conditions.", style="dim")
 
 
 def add(
@@ -293,11 +326,12 @@ def add(
     out: Annotated[Path, typer.Option("--out", help="Model file to write.")] = Path("my_hand.yaml"),
     objects: Objects = None,
     signals: Signals = None,
+    rig: RigFile = None,
     report: ReportFile = None,
     json: Json = False,
 ) -> None:
     """Add effects to the model, fit them, and show the error fall on held-out data."""
-    prepared = _prepared(bags, model, objects, signals)
+    prepared = _prepared(bags, model, objects, signals, rig)
     with _Progress(quiet=json) as progress:
         found = add_effects(prepared, effect_sources(only=effects, model=prepared.model), progress=progress)
     path = replace(
@@ -377,14 +411,22 @@ def report(
     effects: Effects = None,
     objects: Objects = None,
     signals: Signals = None,
+    rig: RigFile = None,
+    max_effects: MaxEffects = MAX_EFFECTS,
+    greedy: Greedy = False,
     jobs: Jobs = _JOBS,
     json: Json = False,
 ) -> None:
     """Compare, diagnose and add, all on one self-contained HTML page."""
-    prepared = _prepared(bags, model, objects, signals)
+    prepared = _prepared(bags, model, objects, signals, rig)
     with _Progress(quiet=json) as progress:
         found = diagnose_model(
-            prepared, effect_sources(effects or (), model=prepared.model), jobs=jobs, progress=progress
+            prepared,
+            effect_sources(effects or (), model=prepared.model),
+            jobs=jobs,
+            progress=progress,
+            max_effects=max_effects,
+            greedy=greedy,
         )
     _write_report(out, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found)
     if json:

@@ -27,8 +27,10 @@ from .fit import Fit
 from .greedy import grow
 from .prepare import Prepared
 from .problem import Problem, build_problem
+from .rig import Rig
 from .screen import usable_effects
 from .search import Candidate, Progress, Search, silent
+from .surrogate import anchored_at
 
 Array = NDArray[np.float64]
 
@@ -41,6 +43,9 @@ WORTHWHILE = 0.05
 
 TIE = 12.0
 """Sets whose penalised costs differ by less cannot be told apart: a likelihood ratio of e^6."""
+
+HOPELESS = 10.0
+"""Sets whose cost is so many times that of the best are not followed."""
 
 MAX_EFFECTS = 3
 
@@ -297,7 +302,8 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
             choice = replace(choice, ranking=ranking)
             break
         new = choice.search.renewed(round_[0])
-        front = [new.refit(c) for c in round_[: WIDE[min(size - 1, len(WIDE) - 1)]]]
+        wide = round_[: WIDE[min(size - 1, len(WIDE) - 1)]]
+        front = [new.refit(c) for c in wide if c.penalised <= HOPELESS * round_[0].penalised]
         front.sort(key=lambda c: c.penalised)
         best = new.polish(front[0])
         limits_new = chance(new.problem, best.fit, new.signatures(best))
@@ -387,12 +393,12 @@ def found_effects(
     return tuple(_found(search, best, name, limits, falls) for name in best.names)
 
 
-def problem_builder(prepared: Prepared, values: Mapping[str, float]) -> Any:
+def problem_builder(prepared: Prepared, rig: Rig, values: Mapping[str, float]) -> Any:
     """A function from Features to a Problem with noise estimated on those features."""
 
     def build(features: Features) -> Problem:
         return build_problem(
-            prepared.rig,
+            rig,
             features,
             prepared.model,
             prepared.nuisances,
@@ -409,8 +415,7 @@ def error_falls(
 
     in_order   take the effects in the order in which they stand
     """
-    problem, features = prepared.problem, prepared.features
-    build = problem_builder(prepared, best.fit.values)
+    features = prepared.features
     nominal = signal_errors(features, features.closures(prepared.rig, prepared.model, {}))
     falls = [
         Fall(
@@ -436,6 +441,9 @@ def error_falls(
     for k, (label, candidate) in enumerate(steps):
         progress(k, len(steps), f"held-out error: {label}")
         f = candidate.fit
+        rig = anchored_at(search.problem.rig, f.model, f.values)
+        build = problem_builder(prepared, rig, best.fit.values)
+        problem = replace(search.problem, rig=rig)
         train, test = held_out_closures(build, features, f.model, f.coordinates, f.z)
         held = held_out_condition_errors(problem, f.model, f.coordinates, f.z)
         by_condition = {condition: overall(own) for condition, own in held.items()}

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from .prepare import Prepared
 from .search import Candidate, Search
+from .surrogate import FAST_PLANT, SLOW_PLANTS
 from .trials import Trial
 
 Array = NDArray[np.float64]
@@ -69,6 +70,8 @@ def separating_experiments(
     Each model predicts one closure with its fitted parameters; differences count in units of the sensors' noise and
     scatter as they were seen in these data, after the nuisance parameters have compensated what they can.
     """
+    if not prepared.rig.experiments:
+        return ()
     tied = tied[:4]
     noise = _noise(prepared)
     out = []
@@ -114,7 +117,9 @@ def _predict(
 ) -> Array:
     rig = type(prepared.rig)([trial])  # type: ignore[call-arg]
     run = rig.simulate(
-        candidate.fit.model,
+        candidate.fit.model.with_plant(FAST_PLANT)
+        if candidate.fit.model.plant in SLOW_PLANTS
+        else candidate.fit.model,
         {n: v for n, v in (values or candidate.fit.values).items() if "@" not in n},
         trial,
         trial.reference,

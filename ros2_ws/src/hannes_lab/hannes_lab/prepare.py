@@ -17,6 +17,7 @@ from .fit import fit
 from .hand import HandRig
 from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig
+from .surrogate import anchored_at, rig_for
 from .trials import SIGNALS, Closure, Trial, make_trial, unique_names
 
 OUTLIER = 6.0
@@ -104,11 +105,13 @@ def prepare(
     *,
     rig: Rig | type[PlantRig] | None = None,
     signals: Sequence[str] | None = None,
+    surrogate: bool = False,
 ) -> Prepared:
     """Estimate noise and scatter at the fitted nominal model.
 
     rig      another machine's rig, or its class; the hand's if None
     signals  which signals take part; all that are there if None
+    surrogate  search a slow plant through a fast one (surrogate.py); `rig` of the result is the exact one
     """
     trials = [without_outliers(trial) for trial in trials]
     rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
@@ -116,11 +119,12 @@ def prepare(
     present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
     features = build_features(trials, present, rig.points)
     nuisances = tuple(rig.nuisances(model))
-    problem = build_problem(rig, features, model, nuisances, {})
+    view = rig_for(rig, model) if surrogate else rig
+    problem = build_problem(view, features, model, nuisances, {})
     coordinates = [nuisance_coordinate(n) for n in nuisances]
     found = fit(problem, model, coordinates, {}, evaluations=15)
     sims = problem.simulations
-    problem = build_problem(rig, features, model, nuisances, found.values)
+    problem = build_problem(anchored_at(view, model, found.values), features, model, nuisances, found.values)
     problem.simulations = sims
     notes = [f"{trial.name}: {note}" for trial in trials for note in trial.notes]
     if len(features.conditions) < 2:

@@ -23,8 +23,8 @@ from .problem import (
     vanishing_entry,
 )
 from .rig import Nuisance
-from .surrogate import AnchoredRig, anchored_at
 from .spectrum import position_periods
+from .surrogate import AnchoredRig, anchored_at
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -56,9 +56,12 @@ REFIT = 8
 POLISH = 3
 """Extensions of a round that are refitted with all derivatives afresh."""
 
-MOVES = 4
-SETTLED = 0.1
-"""The anchor of a slow plant moves at most so often, or until no coordinate moves by more than this."""
+MOVES = 2
+"""How often the anchor of a slow plant moves before the slow plant itself is fitted."""
+
+EXACT = 3
+SETTLED = 2.0
+"""Fits on the slow plant with derivatives of its own: at most so many, while the cost falls by more than this."""
 
 PENALTY = 4.0
 """Cost of one parameter (Akaike's 2 doubled, since shape parameters are searched over several starts)."""
@@ -275,7 +278,9 @@ class Search:
         use = slice(None) if self.rows is None else self.rows
         costs = []
         for one in (start, kept):
-            r = self.problem.residual(model, {c.name: c.value(one.get(c.name, 0.0)) for c in coordinates})[use]
+            r = self.problem.residual(model, {c.name: c.value(one.get(c.name, 0.0)) for c in coordinates})[
+                use
+            ]
             costs.append(float(r @ r) + sum(one.get(c.name, 0.0) ** 2 for c in coordinates if c.prior))
         return start if costs[0] <= costs[1] else kept
 
@@ -297,18 +302,34 @@ class Search:
         return candidate
 
     def _settle(self, found: Fit) -> Fit:
-        """A fit on a slow plant seen through a fast one, with the anchor moved to where the fit ends, until it stays."""
-        if not isinstance(self.problem.rig, AnchoredRig):
+        """A fit that was made on a slow plant seen through a fast one, carried on to the slow plant itself.
+
+        First the anchor moves to where the fit ends; then the slow plant's own derivatives are taken, which the fast
+        one's only resemble, and kept for a few steps.
+        """
+        rig = self.problem.rig
+        if not isinstance(rig, AnchoredRig):
             return found
         for _ in range(MOVES):
-            problem = replace(self.problem, rig=anchored_at(self.problem.rig, found.model, found.values))
-            again = fit(problem, found.model, found.coordinates, found.z, rows=self.rows, evaluations=8)
-            moved = float(np.max(np.abs(again.z - found.z), initial=0.0))
-            self.problem.simulations, self.problem.failures = problem.simulations, problem.failures
-            found = again
-            if moved < SETTLED:
+            seen = replace(self.problem, rig=anchored_at(rig, found.model, found.values))
+            found = fit(seen, found.model, found.coordinates, found.z, rows=self.rows, evaluations=8)
+        exact = replace(self.problem, rig=rig.exact)
+        best: Fit | None = None
+        for _ in range(EXACT):
+            values = found.values
+            residual = exact.residual(found.model, values)
+            columns = finite_differences(
+                exact, found.model, found.coordinates, found.z, residual, range(found.z.size)
+            )
+            known = {c.name: columns[:, k] for k, c in enumerate(found.coordinates)}
+            found = fit(
+                exact, found.model, found.coordinates, found.z, rows=self.rows, known=known, evaluations=8
+            )
+            if best is not None and found.cost > best.cost - SETTLED:
                 break
-        return found
+            best = found
+        self.problem.simulations, self.problem.failures = exact.simulations, exact.failures
+        return best if best is not None and best.cost <= found.cost else found
 
     def renewed(self, best: Candidate) -> Search:
         """The same search with noise and scatter estimated at another point: sensitivities there are the true ones."""

@@ -240,7 +240,8 @@ _SCALED = {"hand.preload": 0.0107, "hand.stiffness": 0.0015, "hand.coulomb": 0.0
 carts are given.  Another value scales all preloads, all rates, or all dry friction of joints and carts alike."""
 
 _OBJECT_NAMES = ("object.stiffness", "object.damping", "object.position")
-"""object.position [rad]: pulley angle at which the object is touched, by its size, as in the reduced plant."""
+"""As in the reduced plant: object.position [rad] is the pulley angle at which the object is touched, by its size;
+object.stiffness [N.m/rad] and object.damping [N.m.s/rad] are those of the whole grasp, referred to the pulley."""
 
 
 class MujocoPlant:
@@ -406,9 +407,9 @@ class MujocoPlant:
                     self.grasp = replace(self.grasp, size=self._opening() - value * self.parameters[_TIP])
                     rebuild = rebuild or self.grasp.shape in PRISM_SIDES
                 elif name == "object.stiffness":
-                    self.grasp = replace(self.grasp, stiffness=value)
+                    self.grasp = replace(self.grasp, stiffness=value / self.parameters[_TIP] ** 2)
                 else:
-                    self.grasp = replace(self.grasp, damping=value)
+                    self.grasp = replace(self.grasp, damping=value / self.parameters[_TIP] ** 2)
                 self._shape_object()
             elif name in _SCALED:
                 self._scaled[name] = value
@@ -440,7 +441,7 @@ class MujocoPlant:
         if name == "object.position" and self.grasp is not None:
             return float((self._opening() - self.grasp.size) / self.parameters[_TIP])
         if name in _OBJECT_NAMES and self.grasp is not None:
-            return float(getattr(self.grasp, name.split(".")[1]))
+            return float(getattr(self.grasp, name.split(".")[1]) * self.parameters[_TIP] ** 2)
         if name in _REBUILD or (name.split(".")[0] in _GROUPS and name in self._values):
             return self._values.value(name)
         raise HannesError(f"The MuJoCo plant has no parameter '{name}'; valid are {', '.join(self.names)}.")
