@@ -1,4 +1,4 @@
-"""An adapter of another machine, as a user would write it: a mass of 2 kg on a linear motor that takes a force command."""
+"""An adapter of another machine, as a user would write it: a mass of 2 kg on a linear motor."""
 
 from pathlib import Path
 

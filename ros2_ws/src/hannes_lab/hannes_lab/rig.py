@@ -168,7 +168,8 @@ class PlantRig:
 
     def effect(self, kind: EffectType) -> EffectType:
         """See Rig."""
-        return scaled_effect(kind, tuple(sorted(self.sizes.items())), self.linear)
+        sizes = tuple(sorted(self.sizes.items()))
+        return scaled_effect(kind, sizes, self.linear)  # type: ignore[arg-type]  # a class is hashable
 
     def controller(self, model: Model, period: float) -> Controller:
         """The control law in the loop."""
