@@ -4,7 +4,7 @@ values."""
 import numpy as np
 import pytest
 from hannes_description.errors import HannesError
-from hannes_stiffness.features import FeatureSpec, FeatureStream, extract, hold
+from hannes_stiffness.features import FEATURES, WINDOW, FeatureSpec, FeatureStream, extract, hold
 
 
 def closure(rate: float, duration: float = 8.0, seed: int = 0, jitter: float = 0.0):
@@ -30,7 +30,7 @@ def assert_same(arrays, spec=None, rate=None):
     assert len(samples) == len(batch.time)
     np.testing.assert_array_equal([s.time for s in samples], batch.time)
     np.testing.assert_array_equal(
-        np.array([s.values for s in samples], np.float32).reshape(-1, 3), batch.values
+        np.array([s.values for s in samples], np.float32).reshape(batch.values.shape), batch.values
     )
     np.testing.assert_array_equal(np.array([s.void for s in samples], bool), batch.void)
     assert (feed.rejected, feed.restarts) == (batch.rejected, batch.restarts)
@@ -40,17 +40,20 @@ def assert_same(arrays, spec=None, rate=None):
 @pytest.mark.parametrize("rate", [5.0, 20.0, 29.0, 30.0, 31.0, 50.0, 100.0, 300.0, 1000.0])
 @pytest.mark.parametrize("jitter", [0.0, 0.1, 0.45])
 @pytest.mark.parametrize("current", ["rectified", "signed"])
-def test_stream_equals_arrays_at_every_rate(rate, jitter, current):
-    batch = assert_same(closure(rate, jitter=jitter), FeatureSpec(current=current))
+@pytest.mark.parametrize("version", FEATURES)
+def test_stream_equals_arrays_at_every_rate(rate, jitter, current, version):
+    batch = assert_same(closure(rate, jitter=jitter), FeatureSpec(current=current, version=version))
     assert len(batch.time) <= 8.0 * min(rate, 30.0) + 2
 
 
 @pytest.mark.parametrize("rate", [7.0, 30.0, 100.0, 1000.0])
-def test_answers_may_come_at_another_rate_with_the_same_meaning(rate):
+@pytest.mark.parametrize("version", FEATURES)
+def test_answers_may_come_at_another_rate_with_the_same_meaning(rate, version):
     arrays = closure(1000.0)
-    batch = assert_same(arrays, rate=rate)
+    spec = FeatureSpec(version=version)
+    batch = assert_same(arrays, spec, rate=rate)
     np.testing.assert_allclose(len(batch.time), 8.0 * rate, atol=1)
-    dense = extract(*arrays, rate=1000.0)
+    dense = extract(*arrays, spec, rate=1000.0)
     same = np.searchsorted(dense.time, batch.time)
     np.testing.assert_array_equal(dense.values[same], batch.values)
     np.testing.assert_array_equal(dense.void[same], batch.void)
@@ -65,6 +68,7 @@ def test_stream_equals_arrays_over_gaps_restarts_and_bad_values():
     t[600:] = t[600:] - 0.05  # a little out of order: dropped until it is past
     for values, bad in ((i, np.nan), (r, np.inf), (q, 1e9), (t, np.nan), (i, -1e300)):
         values[rng.integers(0, len(t), 5)] = bad
+    assert_same((t, i, r, q), FeatureSpec(version=WINDOW))
     batch = assert_same((t, i, r, q))
     assert batch.restarts == 2
     assert batch.rejected >= 20
@@ -82,7 +86,9 @@ def test_stream_equals_arrays_on_random_clocks(seed):
             p=[0.4, 0.2, 0.2, 0.05, 0.05, 0.05, 0.03, 0.02],
         )
     )
-    assert_same((t, rng.normal(0, 1, n), np.cumsum(rng.normal(0, 0.1, n)), np.cumsum(rng.normal(0, 0.1, n))))
+    arrays = (t, rng.normal(0, 1, n), np.cumsum(rng.normal(0, 0.1, n)), np.cumsum(rng.normal(0, 0.1, n)))
+    for version in FEATURES:
+        assert_same(arrays, FeatureSpec(version=version))
 
 
 def test_samples_come_at_the_trained_rate_and_average_the_current():
@@ -158,3 +164,53 @@ def test_arrays_of_different_length_are_refused():
 def test_nothing_in_nothing_out():
     assert len(extract([], [], [], []).time) == 0
     assert extract([np.nan], [0.0], [0.0], [0.0]).rejected == 1
+
+
+def grasp(slope: float, contact: float = 8.0, free: float = 0.2, n: int = 45):
+    """A slow closure at 10 rad/s and 30 Hz: the current is the nominal free one, then rises by `slope` A/rad."""
+    from hannes_stiffness.window import INERTIA, SPRING, VISCOUS
+
+    t = np.arange(n) / 30.0
+    q = 10.0 * t
+    i = free + VISCOUS * 10.0 + SPRING * q + slope * np.maximum(0.0, q - contact)
+    assert INERTIA > 0.0
+    return t, i, q + 0.5, q
+
+
+@pytest.mark.parametrize("slope", [0.06, 0.3, 1.5])
+def test_a_window_sees_slopes_and_the_grasp_its_line(slope):
+    spec = FeatureSpec(version=WINDOW, mask=0.0)
+    t, i, r, q = grasp(slope)
+    batch = extract(t, i, r, q, spec)
+    last = dict(zip(spec.names, batch.values[-1], strict=True))
+    per_radian = 0.01 * np.expm1(last["loading_line"])
+    # The first sample above the free level is up to LIFT high, so that the line starts a little late.
+    np.testing.assert_allclose(per_radian, slope, rtol=0.1)
+    np.testing.assert_allclose(0.2 * np.expm1(last["current_slope"]), 10.0 * (slope + 0.0094), rtol=0.01)
+    np.testing.assert_allclose(last["encoder_velocity"], 10.0, rtol=1e-4)
+    np.testing.assert_allclose(last["tracking_error"], 0.5, rtol=1e-4)
+    np.testing.assert_allclose(last["current_range"], i[-1] - i[-7], rtol=1e-4)
+    assert 8.0 - 0.5 <= last["contact_encoder"] <= 8.0 + 0.05 / slope + 0.35
+    # It follows a gentle rise until `LIFT` tells it from the free level.
+    np.testing.assert_allclose(last["free_level"], 0.2, atol=0.03)
+
+
+def test_nothing_grasped_shows_no_contact():
+    spec = FeatureSpec(version=WINDOW, mask=0.0)
+    batch = extract(*grasp(0.0), spec)
+    last = dict(zip(spec.names, batch.values[-1], strict=True))
+    assert abs(last["load_above_free"]) < 0.01
+    assert last["largest_rise"] == 0.0
+
+
+def test_a_ripple_of_the_reference_is_no_new_closure_and_a_new_closure_forgets():
+    spec = FeatureSpec(version=WINDOW)
+    t = np.arange(300) / 30.0
+    ripple = 10.0 + 1.0 * np.sin(2.0 * np.pi * 1.5 * t)
+    reference = np.where(
+        t < 5.0, ripple, np.maximum(0.0, 14.0 * np.sin(2.0 * np.pi * 0.25 * (t - 6.0)) * (t > 6.0))
+    )
+    batch = extract(t, np.full(300, 1.0), reference, reference, spec)
+    starts = t[np.flatnonzero(np.diff(batch.void.astype(int)) == 1) + 1]
+    assert len(starts[starts > 0.5]) == 1
+    assert 6.0 < starts[-1] < 6.2

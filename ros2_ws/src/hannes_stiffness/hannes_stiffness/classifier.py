@@ -1,22 +1,20 @@
-"""The thesis' classifier as the baseline: bagged trees on single samples, stored as ONNX with a manifest.
+"""The trained classifier on disk and in use: one ONNX file with its manifest.
 
-Bagging: every tree sees a bootstrap sample of the data and all three features; the probabilities of the
-trees' leaves are averaged (Breiman, Bagging predictors, Machine Learning 24, 1996). The rules of `features`
-stand before the trees: a sample that they call void is void with probability 1.
-
-On disk there are two files, `NAME.onnx` (the trees) and `NAME.json` (the manifest: features and their
-version, class names, training data, seed, scores, versions, and the hash of the ONNX file). Both are data:
-nothing in them runs. scikit-learn and skl2onnx are needed to train, onnxruntime to answer; each is imported
-at its first use.
+On disk there are two files, `NAME.onnx` (the classifier, and the regression of the stiffness where there is one) and
+`NAME.json` (the manifest: method, features and their version, class names, calibration, training data, seed, scores,
+versions, and the hash of the ONNX file). Both are data: nothing in them runs. The rules of `features` stand before the
+model: a sample that they call void is void with probability 1. scikit-learn and skl2onnx are needed to train,
+onnxruntime to answer; each is imported at its first use.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import platform
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
@@ -27,128 +25,24 @@ from hannes_description.errors import HannesError
 from hannes_description.signals import STIFFNESS_CLASSES
 from numpy.typing import ArrayLike, NDArray
 
-from .features import FEATURE_NAMES, FeatureSpec
+from .features import FEATURES, FeatureSpec
+from .models import LEAST_SPREAD, Calibration, Estimator, apply_rules
 
-SCHEMA = "hannes/stiffness/1"
+SCHEMA = "hannes/stiffness/2"
 BASELINE = "baseline"
+"""The thesis' method."""
+DEFAULT = "window"
+SHIPPED = (DEFAULT, BASELINE)
+"""Classifiers that come with the package, by name."""
+NOT_SURE = -1
+"""Class number of an answer that is not sure."""
+NOT_SURE_LABEL = "not sure"
 _INPUT = "features"
+_PROBABILITIES, _VALUE, _SPREAD = "probabilities", "log10_stiffness", "log10_spread"
 _LARGEST_ONNX, _LARGEST_MANIFEST = 100 << 20, 4 << 20
 """Sizes, bytes, above which a file cannot be one of ours."""
-
-
-@dataclass(frozen=True)
-class TreeSettings:
-    """Settings of the bagged trees.
-
-    trees     how many (30, the usual size of such a bag)
-    leaves    most leaves of one tree; bounds the size of the file
-    leaf      least samples in a leaf
-    folds     folds of the cross-validation (5, P20), grouped by closure
-    """
-
-    trees: int = 30
-    leaves: int = 256
-    leaf: int = 5
-    folds: int = 5
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("trees", 1, 1000),
-            ("leaves", 2, 100_000),
-            ("leaf", 1, 10_000),
-            ("folds", 2, 100),
-        ):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-                raise HannesError(
-                    f"Tree setting {name}={value!r} must be a whole number from {low} to {high}."
-                )
-
-
-@dataclass(frozen=True)
-class TrainingData:
-    """Samples to learn from.
-
-    values  (n, 3) float32 current A, reference rad, encoder rad
-    labels  (n,) class numbers
-    void    (n,) bool: void by rule, whatever the trees say
-    groups  (n,) number of the closure; a closure is never split between training and validation
-    """
-
-    values: NDArray[np.float32]
-    labels: NDArray[np.int64]
-    void: NDArray[np.bool_]
-    groups: NDArray[np.int64]
-
-    def __post_init__(self) -> None:
-        n = len(self.values)
-        if (
-            self.values.shape != (n, len(FEATURE_NAMES))
-            or not len(self.labels) == len(self.void) == len(self.groups) == n
-        ):
-            raise HannesError(
-                f"Training data do not fit together: values {self.values.shape}, labels {self.labels.shape}, "
-                f"void {self.void.shape}, groups {self.groups.shape}."
-            )
-        if not np.isfinite(self.values).all():
-            raise HannesError("Training data hold values that are not finite.")
-
-
-def make_trees(seed: int, settings: TreeSettings) -> Any:
-    """The untrained bag of trees (scikit-learn).
-
-    A random forest that looks at all features at every split is a bag of trees, and converts to one ONNX
-    operator.
-    """
-    from sklearn.ensemble import RandomForestClassifier
-
-    return RandomForestClassifier(
-        n_estimators=settings.trees,
-        max_features=None,
-        bootstrap=True,
-        random_state=seed,
-        max_leaf_nodes=settings.leaves,
-        min_samples_leaf=settings.leaf,
-    )
-
-
-def fit(data: TrainingData, *, seed: int, settings: TreeSettings | None = None) -> Any:
-    """Trees trained on the data. Raises HannesError where a class is missing."""
-    settings = settings or TreeSettings()
-    missing = [n for k, n in enumerate(STIFFNESS_CLASSES) if not np.any(data.labels == k)]
-    if missing:
-        raise HannesError(
-            f"The training data hold no sample of {' and '.join(missing)}; the classifier needs all of "
-            f"{', '.join(STIFFNESS_CLASSES)}."
-        )
-    return make_trees(seed, settings).fit(data.values, data.labels)
-
-
-def apply_rules(probabilities: NDArray[np.float64], void: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Probabilities (n, 3) with the samples that are void by rule set to (1, 0, 0)."""
-    return np.where(void[:, None], np.array([1.0, 0.0, 0.0]), probabilities)
-
-
-def cross_validate(
-    data: TrainingData, *, seed: int, settings: TreeSettings | None = None
-) -> NDArray[np.int64]:
-    """Class (n,) of every sample, answered by trees that saw no sample of its closure."""
-    from sklearn.model_selection import StratifiedGroupKFold
-
-    settings = settings or TreeSettings()
-    if len(np.unique(data.groups)) < settings.folds:
-        raise HannesError(f"{len(np.unique(data.groups))} closures are too few for {settings.folds} folds.")
-    answer = np.zeros(len(data.labels), dtype=np.int64)
-    folds = StratifiedGroupKFold(n_splits=settings.folds, shuffle=True, random_state=seed)
-    for training, held_out in folds.split(data.values, data.labels, data.groups):
-        part = TrainingData(
-            data.values[training], data.labels[training], data.void[training], data.groups[training]
-        )
-        trees = fit(part, seed=seed, settings=settings)
-        answer[held_out] = np.argmax(
-            apply_rules(trees.predict_proba(data.values[held_out]), data.void[held_out]), axis=1
-        )
-    return answer
+STIFFNESS_RANGE = (100.0, 100e3)
+"""N/m; range of the training, beyond which no estimate goes."""
 
 
 def _versions() -> dict[str, str]:
@@ -170,41 +64,41 @@ def _versions() -> dict[str, str]:
 
 
 def save(
-    trees: Any,
+    model: Any,
     path: str | Path,
     *,
+    method: str,
     spec: FeatureSpec,
     seed: int,
-    settings: TreeSettings,
+    settings: Mapping[str, object],
     training: Mapping[str, object],
     scores: Mapping[str, object],
+    calibration: Calibration | None = None,
+    sure: float = 0.0,
+    estimator: Estimator | None = None,
 ) -> Path:
-    """Write `path` (.onnx) and its manifest (.json beside it); answer the path of the ONNX file."""
-    from skl2onnx import convert_sklearn
-    from skl2onnx.common.data_types import FloatTensorType
+    """Write `path` (.onnx) and its manifest (.json beside it); answer the path of the ONNX file.
 
+    method     what the model is called
+    sure       least probability of a sure answer
+    estimator  the regression of the stiffness
+    """
     path = _onnx_path(path)
-    model = convert_sklearn(
-        trees,
-        name="hannes_stiffness",
-        options={id(trees): {"zipmap": False}},
-        initial_types=[(_INPUT, FloatTensorType([None, len(FEATURE_NAMES)]))],
-        target_opset={"": 17, "ai.onnx.ml": 3},
-    )
-    content = model.SerializeToString()
+    parts = {_PROBABILITIES: model}
+    if estimator is not None:
+        parts |= {_VALUE: estimator.value, _SPREAD: estimator.spread}
+    content = _to_onnx(parts, len(spec.names)).SerializeToString()
     manifest = {
         "schema": SCHEMA,
-        "method": "bagged trees on single samples",
+        "method": method,
         "features": spec.to_dict(),
-        "feature_names": list(FEATURE_NAMES),
+        "feature_names": list(spec.names),
         "classes": list(STIFFNESS_CLASSES),
+        "calibration": None if calibration is None else calibration.to_dict(),
+        "sure": sure,
+        "interval_factor": None if estimator is None else round(estimator.factor, 6),
         "seed": seed,
-        "settings": {
-            "trees": settings.trees,
-            "leaves": settings.leaves,
-            "leaf": settings.leaf,
-            "folds": settings.folds,
-        },
+        "settings": dict(settings),
         "training": dict(training),
         "scores": dict(scores),
         "versions": _versions(),
@@ -217,6 +111,41 @@ def save(
     except OSError as error:
         raise HannesError(f"Cannot write the classifier '{path}': {error}.") from error
     return path
+
+
+def _to_onnx(parts: Mapping[str, Any], width: int) -> Any:
+    """One ONNX model of several scikit-learn models on the same input, an output each."""
+    import onnx
+    from onnx.compose import add_prefix
+    from skl2onnx import convert_sklearn
+    from skl2onnx.common.data_types import FloatTensorType
+
+    nodes, initializers, outputs = [], [], []
+    merged = None
+    for name, model in parts.items():
+        options = {id(model): {"zipmap": False}} if name == _PROBABILITIES else None
+        merged = convert_sklearn(
+            model,
+            name="hannes_stiffness",
+            options=options,
+            initial_types=[(_INPUT, FloatTensorType([None, width]))],
+            target_opset={"": 17, "ai.onnx.ml": 3},
+        )
+        add_prefix(merged, f"{name}/", rename_inputs=False, inplace=True)
+        # A classifier gives labels and probabilities, a regression its value alone: the last one counts.
+        last = merged.graph.output[-1]
+        nodes += [*merged.graph.node, onnx.helper.make_node("Identity", [last.name], [name])]
+        initializers += list(merged.graph.initializer)
+        columns = len(STIFFNESS_CLASSES) if name == _PROBABILITIES else 1
+        outputs.append(onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [None, columns]))
+    if merged is None:
+        raise HannesError("There is no model to write.")
+    graph = onnx.helper.make_graph(
+        nodes, "hannes_stiffness", [merged.graph.input[0]], outputs, initializer=initializers
+    )
+    return onnx.helper.make_model(
+        graph, opset_imports=list(merged.opset_import), ir_version=merged.ir_version, producer_name="hannes"
+    )
 
 
 def _onnx_path(path: str | Path) -> Path:
@@ -265,36 +194,73 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class StiffnessClassifier:
-    """A loaded classifier. `load` reads it; `probabilities` answers.
+class Answers:
+    """What a classifier says to feature samples.
 
-    spec      what its features are
-    manifest  all that the manifest says
-    session   the onnxruntime session
+    probabilities  (n, 3) of void, rigid, soft
+    stiffness      (n, 3) N/m: estimate, lower and upper end of its interval; NaN where there is none
+    """
+
+    probabilities: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
+
+    @property
+    def classes(self) -> NDArray[np.int64]:
+        """Most probable class (n,)."""
+        return np.argmax(self.probabilities, axis=1).astype(np.int64)
+
+    def sure(self, least: float) -> NDArray[np.int64]:
+        """Class (n,), NOT_SURE where its probability is below `least`."""
+        return np.where(self.probabilities.max(axis=1) < least, NOT_SURE, self.classes)
+
+
+def class_label(number: int) -> str:
+    """Name of an answered class; "not sure" for NOT_SURE."""
+    return NOT_SURE_LABEL if number == NOT_SURE else STIFFNESS_CLASSES[number]
+
+
+@dataclass(frozen=True)
+class StiffnessClassifier:
+    """A loaded classifier. `load` reads it; `answer` answers.
+
+    spec         what its features are
+    manifest     all that the manifest says
+    session      the onnxruntime session
+    calibration  of its probabilities
+    least        least probability of a sure answer
+    factor       half the interval of the stiffness over its spread; NaN where it does not estimate
     """
 
     spec: FeatureSpec
     manifest: Mapping[str, Any]
     session: Any
+    calibration: Calibration | None = None
+    least: float = 0.0
+    factor: float = math.nan
+    _outputs: Sequence[str] = field(default=(_PROBABILITIES,), repr=False)
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> StiffnessClassifier:
-        """Load `path` (.onnx, with its .json beside it), or the shipped baseline.
+        """Load `path` (.onnx, with its .json beside it), or a shipped one by name (empty: the default).
 
         Raises HannesError where a file is missing or broken, where the ONNX file is not the one that the
         manifest describes (sha256), or where the features are of another version.
         """
         if path is None or str(path) == "":
-            path = Path(str(files("hannes_stiffness") / "data" / f"{BASELINE}.onnx"))
+            path = DEFAULT
+        if str(path) in SHIPPED:
+            path = Path(str(files("hannes_stiffness") / "data" / f"{path}.onnx"))
         path = _onnx_path(path)
         manifest_path = path.with_suffix(".json")
         manifest = _read_manifest(manifest_path)
-        spec = FeatureSpec.from_dict(manifest.get("features"), f"The manifest '{manifest_path}'")
-        if manifest.get("feature_names") != list(FEATURE_NAMES):
+        where = f"The manifest '{manifest_path}'"
+        spec = FeatureSpec.from_dict(manifest.get("features"), where)
+        if manifest.get("feature_names") != list(spec.names):
             raise HannesError(
-                f"The manifest '{manifest_path}' names the features {manifest.get('feature_names')!r}; this "
-                f"version computes {list(FEATURE_NAMES)}."
+                f"{where} names the features {manifest.get('feature_names')!r}; this version computes "
+                f"{list(FEATURES[spec.version])}."
             )
+        calibration, least, factor = _numbers(manifest, where)
         content = _read(path, _LARGEST_ONNX, "classifier file")
         found, stated = hashlib.sha256(content).hexdigest(), manifest["onnx"]["sha256"]
         if found != stated:
@@ -303,30 +269,72 @@ class StiffnessClassifier:
                 f"not {stated[:12]}): one of the two is broken or was changed. Train it again with "
                 "`hannes stiffness train`."
             )
-        return cls(spec, manifest, _session(content, path))
+        outputs = (_PROBABILITIES,) if math.isnan(factor) else (_PROBABILITIES, _VALUE, _SPREAD)
+        session = _session(content, path, len(spec.names), outputs)
+        return cls(spec, manifest, session, calibration, least, factor, outputs)
 
-    def probabilities(self, values: ArrayLike, void: ArrayLike) -> NDArray[np.float64]:
-        """Probabilities (n, 3), order void, rigid, soft, of feature samples.
+    @property
+    def estimates(self) -> bool:
+        """Whether it estimates the stiffness."""
+        return not math.isnan(self.factor)
 
-        values (n, 3) current A, reference rad, encoder rad; void (n,) bool, void by rule.
+    def answer(self, values: ArrayLike, void: ArrayLike) -> Answers:
+        """Answers to feature samples: values (n, k) in the order of the spec's names; void (n,) bool, void by rule.
+
+        The interval holds the truth in nine of ten samples like those of the training; an estimate belongs to a
+        sample that is not void.
         """
         x = np.ascontiguousarray(values, dtype=np.float32)
         rule = np.asarray(void, dtype=bool)
-        if x.ndim != 2 or x.shape[1] != len(FEATURE_NAMES) or rule.shape != (len(x),):
+        width = len(self.spec.names)
+        if x.ndim != 2 or x.shape[1] != width or rule.shape != (len(x),):
             raise HannesError(
-                f"The classifier needs samples of shape (n, {len(FEATURE_NAMES)}) and a rule (n,); it got "
-                f"{x.shape} and {rule.shape}."
+                f"The classifier needs samples of shape (n, {width}) and a rule (n,); it got {x.shape} and "
+                f"{rule.shape}."
             )
+        stiffness = np.full((len(x), 3), np.nan)
         if not len(x):
-            return np.empty((0, len(STIFFNESS_CLASSES)))
-        return apply_rules(self.session.run(["probabilities"], {_INPUT: x})[0].astype(float), rule)
+            return Answers(np.empty((0, len(STIFFNESS_CLASSES))), stiffness)
+        out = self.session.run(list(self._outputs), {_INPUT: x})
+        probabilities = out[0].astype(float)
+        if self.calibration is not None:
+            probabilities = self.calibration.apply(probabilities)
+        if self.estimates:
+            value, half = out[1][:, 0].astype(float), out[2][:, 0].astype(float)
+            half = self.factor * np.maximum(half, LEAST_SPREAD)
+            stiffness = np.clip(10.0 ** (value[:, None] + half[:, None] * (0.0, -1.0, 1.0)), *STIFFNESS_RANGE)
+            stiffness[rule] = np.nan
+        return Answers(apply_rules(probabilities, rule), stiffness)
+
+    def probabilities(self, values: ArrayLike, void: ArrayLike) -> NDArray[np.float64]:
+        """Probabilities (n, 3), order void, rigid, soft, of feature samples as in `answer`."""
+        return self.answer(values, void).probabilities
 
     def classify(self, values: ArrayLike, void: ArrayLike) -> NDArray[np.int64]:
-        """Class numbers (n,) of feature samples (0 void, 1 rigid, 2 soft)."""
-        return np.argmax(self.probabilities(values, void), axis=1).astype(np.int64)
+        """Class numbers (n,) of feature samples (0 void, 1 rigid, 2 soft), sure or not."""
+        return self.answer(values, void).classes
 
 
-def _session(content: bytes, path: Path) -> Any:
+def _numbers(manifest: Mapping[str, Any], where: str) -> tuple[Calibration | None, float, float]:
+    """Calibration, least probability of a sure answer, and factor of the interval."""
+    given = manifest.get("calibration")
+    try:
+        calibration = (
+            None
+            if given is None
+            else Calibration(np.array(given["weights"], dtype=float), np.array(given["bias"], dtype=float))
+        )
+        least = float(manifest["sure"])
+        factor = manifest["interval_factor"]
+        factor = math.nan if factor is None else float(factor)
+    except (KeyError, TypeError, ValueError) as error:
+        raise HannesError(f"{where}: calibration, sure or interval_factor is wrong: {error}.") from error
+    if not 0.0 <= least <= 1.0 or factor < 0.0 or math.isinf(factor):
+        raise HannesError(f"{where}: sure must be from 0 to 1 and interval_factor not negative.")
+    return calibration, least, factor
+
+
+def _session(content: bytes, path: Path, width: int, wanted: Sequence[str]) -> Any:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -345,11 +353,11 @@ def _session(content: bytes, path: Path) -> Any:
         ) from error
     if (
         [i.name for i in inputs] != [_INPUT]
-        or inputs[0].shape[-1] != len(FEATURE_NAMES)
-        or "probabilities" not in outputs
+        or inputs[0].shape[-1] != width
+        or not set(wanted) <= set(outputs)
     ):
         raise HannesError(
             f"The classifier file '{path}' takes {[i.name for i in inputs]} and gives {outputs}; a Hannes "
-            f"classifier takes '{_INPUT}' (n, {len(FEATURE_NAMES)}) and gives 'probabilities'."
+            f"classifier takes '{_INPUT}' (n, {width}) and gives {', '.join(wanted)}."
         )
     return session

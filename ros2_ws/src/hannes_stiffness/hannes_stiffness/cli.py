@@ -26,9 +26,7 @@ app = typer.Typer(
 )
 
 SeedOption = Annotated[int, typer.Option(help="Seed; the same seed gives the same result.", min=0)]
-ClosuresOption = Annotated[
-    int, typer.Option(help="Closures to simulate, a third of each kind.", min=15, max=1_000_000)
-]
+ClosuresOption = Annotated[int, typer.Option(help="Closures to simulate.", min=15, max=1_000_000)]
 HandsOption = Annotated[
     int, typer.Option(help="Hands of the population; 1 is the model as it is.", min=1, max=100_000)
 ]
@@ -38,32 +36,51 @@ ModelOption = Annotated[
 ]
 JobsOption = Annotated[int, typer.Option(help="Processes; the result does not depend on it.", min=1, max=256)]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
-ClassifierOption = Annotated[str, typer.Option(help="Trained classifier (.onnx); empty: the one installed.")]
+VarietyOption = Annotated[
+    str,
+    typer.Option(
+        help="What is drawn: wide (100 N/m to 100 kN/m, all shapes, hidden effects), narrow or two (stiffnesses)."
+    ),
+]
+ObjectsOption = Annotated[
+    int | None, typer.Option(help="Different objects; without it every closure has its own.", min=1)
+]
+ClassifierOption = Annotated[
+    str,
+    typer.Option(help="Trained classifier (.onnx), or baseline (the thesis' method); empty: the default."),
+]
 
 # Data sets that are scored but not trained on have seeds of their own, so that no closure occurs twice.
 _HELD_OUT_SEED = 1_000_003
+# Shapes exist in the multi-body plant only, which most closures are therefore of.
+_MODELS = ["nominal_mujoco", "nominal_mujoco", "nominal_mujoco", "nominal"]
 
 
 @app.command()
 def dataset(
-    out: Annotated[Path, typer.Option(help="File to write (.npz).")],
+    out: Annotated[
+        Path, typer.Option(help="Folder of the bag set; given again, it goes on where it stopped.")
+    ],
     seed: SeedOption = 1,
-    closures: ClosuresOption = 1200,
-    hands: HandsOption = 1,
-    model: ModelOption = ["nominal"],  # noqa: B006 (typer copies it)
+    closures: ClosuresOption = 4000,
+    hands: HandsOption = 300,
+    objects: ObjectsOption = 600,
+    variety: VarietyOption = "wide",
+    model: ModelOption = _MODELS,
     jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate closures on nothing, on soft and on rigid objects, measured as the thesis measures."""
-    made = _simulate("closures", closures, seed, hands, model, jobs)
-    path = made.save(out)
-    result = {"file": str(path), "bytes": path.stat().st_size, **made.manifest}
+    """Simulate closures on nothing and on objects, measured as the thesis measures; write a bag set with a manifest."""
+    made = _simulate("closures", closures, seed, hands, model, jobs, variety, objects, out)
+    size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
+    result = {"folder": str(out), "bytes": size, **made.manifest}
     _show(
         result,
         as_json,
         lambda: print(
-            f"{closures} closures ({_listed(made.manifest['kinds'])}) of {hands} hand(s), "
-            f"model {', '.join(made.manifest['models'])}: {path} ({path.stat().st_size / 1e6:.1f} MB)"
+            f"{closures} closures ({_listed(made.manifest['kinds'])}) on {made.manifest['objects']} objects by "
+            f"{made.manifest['hands']} hand(s), model {', '.join(made.manifest['models'])}, "
+            f"{len(made.manifest['diverged'])} diverged: {out} ({size / 1e6:.1f} MB)"
         ),
     )
 
@@ -75,34 +92,49 @@ def train(
     ],
     seed: SeedOption = 1,
     data: Annotated[
-        Path | None, typer.Option(help="Data set (.npz); without it, closures are simulated.")
+        Path | None, typer.Option(help="Bag set of `dataset`; without it, closures are simulated.")
     ] = None,
+    method: Annotated[
+        str,
+        typer.Option(
+            help="best (compares all, takes the best one on windows), thesis (bagged trees on single samples), "
+            "forest, boosting, network or logistic."
+        ),
+    ] = "best",
     closures: ClosuresOption = 1200,
-    hands: HandsOption = 1,
-    model: ModelOption = ["nominal"],  # noqa: B006 (typer copies it)
+    hands: HandsOption = 300,
+    objects: ObjectsOption = 600,
+    variety: VarietyOption = "wide",
+    model: ModelOption = _MODELS,
     jobs: JobsOption = 1,
     current: Annotated[str, typer.Option(help="Current as the feature: rectified or signed.")] = "rectified",
     trees: Annotated[int, typer.Option(help="Trees in the bag.", min=1, max=1000)] = 30,
     leaves: Annotated[int, typer.Option(help="Most leaves of a tree.", min=2, max=100_000)] = 256,
+    folds: Annotated[int, typer.Option(help="Folds of the cross-validation.", min=2, max=100)] = 5,
+    held_out: Annotated[
+        int | None, typer.Option(help="Closures that are scored only; without it a quarter as many.", min=0)
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Train the thesis' bagged trees on single samples, score them on unseen closures, and store them."""
-    from .classifier import StiffnessClassifier, TreeSettings
+    """Train a classifier with calibrated probabilities and an estimate of the stiffness, and store it."""
+    from .classifier import StiffnessClassifier
     from .dataset import Dataset
-    from .features import FeatureSpec
-    from .training import train as train_trees
+    from .models import TreeSettings
+    from .training import train as train_classifier
 
-    spec, settings = FeatureSpec(current=current), TreeSettings(trees=trees, leaves=leaves)
-    training = Dataset.load(data) if data else _simulate("training", closures, seed, hands, model, jobs)
-    count = max(60, len(training.closures) // (4 * len(model)))
-    held_out = {}
-    for name in model:
-        for what, step, count_of_hands in (("objects", 1, 1), ("hands", 2, count)):
-            title = f"held_out_{what}, {Model.load(name).name}"
-            held_out[title] = _simulate(
-                title, count, seed + step * _HELD_OUT_SEED, count_of_hands, [name], jobs
-            )
-    path = train_trees(training, out, seed=seed, spec=spec, settings=settings, held_out=held_out, say=_say)
+    settings = TreeSettings(trees=trees, leaves=leaves, folds=folds)
+    if data:
+        training = Dataset.load(data)
+    else:
+        training = _simulate("training", closures, seed, hands, model, jobs, variety, objects)
+    count = max(60, len(training.closures) // 4) if held_out is None else held_out
+    others = {}
+    for name in dict.fromkeys(model) if count else ():
+        title = f"held_out, {Model.load(name).name}"
+        others[title] = _simulate(title, count, seed + _HELD_OUT_SEED, hands, [name], jobs, variety)
+    path = train_classifier(
+        training, out, seed=seed, method=method, current=current, settings=settings, held_out=others, say=_say
+    )
     manifest = dict(StiffnessClassifier.load(path).manifest)
     _show({"file": str(path), **manifest}, as_json, lambda: _print_training(path, manifest))
 
@@ -115,36 +147,74 @@ def evaluate(
         str | None,
         typer.Option(help=f"What was grasped ({', '.join(STIFFNESS_CLASSES)}), where a bag does not say it."),
     ] = None,
+    pictures: Annotated[Path | None, typer.Option(help="Folder for pictures of closures and scores.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Score the classifier on bags as the thesis does: mode over 200 ms windows, precision, recall and F1."""
+    """Score the classifier on bags: windows as the thesis does, grasps, latency, reliability, stiffness."""
     from hannes_bags.reading import read_bag
 
     from .classifier import StiffnessClassifier
-    from .training import evaluate as evaluate_recordings
-    from .training import scene_of
+    from .evaluation import answer, scores_of
+    from .training import measured_closures
 
     loaded = StiffnessClassifier.load(classifier)
-    recordings = []
-    for bag in bags:
+    closures = []
+    for bag in _bags(bags):
         _say(f"Reading {bag}.")
-        recording = read_bag(bag)
-        recordings.append((recording, scene_of(recording, kind)))
-    result = evaluate_recordings(loaded, recordings)
+        closures += measured_closures(read_bag(bag), kind)
+    answered = answer(loaded, closures)
+    result = scores_of(answered)
+    if pictures is not None:
+        from .pictures import draw
+
+        for path in draw(answered, result, pictures):
+            _say(f"Picture: {path}")
     _show(
-        {"classifier": loaded.manifest["onnx"]["sha256"], "bags": [str(b) for b in bags], **result},
+        {
+            "classifier": loaded.manifest["onnx"]["sha256"],
+            "method": loaded.manifest["method"],
+            "bags": [str(b) for b in bags],
+            **result,
+        },
         as_json,
         lambda: _print_scores(result),
     )
 
 
-def _simulate(what: str, closures: int, seed: int, hands: int, names: Sequence[str], jobs: int) -> Dataset:
+def _bags(given: Sequence[Path]) -> list[Path]:
+    """The bags; a bag set stands for all of its parts."""
+    from .dataset import MANIFEST
+
+    out: list[Path] = []
+    for path in given:
+        out += sorted(path.glob("part_*[0-9]")) if (path / MANIFEST).is_file() else [path]
+    return out
+
+
+def _simulate(
+    what: str,
+    closures: int,
+    seed: int,
+    hands: int,
+    names: Sequence[str],
+    jobs: int,
+    variety: str,
+    objects: int | None = None,
+    folder: Path | None = None,
+) -> Dataset:
     from .dataset import draw_scenes, make_dataset
 
-    models = [Model.load(name) for name in names]
-    scenes = draw_scenes(closures, seed, hands=hands, models=[model.name for model in models])
+    models = {name: Model.load(name) for name in names}
+    scenes = draw_scenes(
+        closures,
+        seed,
+        hands=hands,
+        models=[models[name].name for name in names],
+        variety=variety,
+        objects=objects,
+    )
     with _progress(what) as progress:
-        return make_dataset(scenes, *models, seed=seed, jobs=jobs, progress=progress)
+        return make_dataset(scenes, *models.values(), seed=seed, jobs=jobs, folder=folder, progress=progress)
 
 
 @contextmanager
@@ -207,15 +277,37 @@ _COLUMNS = ("", "windows", "F1", *(f"F1 {name}" for name in STIFFNESS_CLASSES))
 
 
 def _print_training(path: Path, manifest: dict[str, Any]) -> None:
+    scores = manifest["scores"]
     rows = [
-        _row(f"{name}, {part}", score[part])
-        for name, score in manifest["scores"].items()
-        for part in ("overlap_50ms", "hop_50ms")
+        [
+            score["title"],
+            grouping,
+            f"{score[grouping]['log_loss']:.4f}",
+            _percent(score[grouping]["right"]),
+            _percent(score[grouping]["overlap_50ms"]["f1"]),
+            _percent(score[grouping]["hop_50ms"]["f1"]),
+        ]
+        for score in scores["cross_validation"].values()
+        for grouping in score
+        if isinstance(score[grouping], dict)
     ]
-    _table(_COLUMNS, rows)
+    print("Cross-validation; no group is split. Right and log loss: samples on which no rule decides.")
+    _table(("method", "groups", "log loss", "right", "window F1, hop 150 ms", "hop 50 ms"), rows)
+    rows = [
+        [
+            name,
+            str(s["closures"]),
+            *(_percent(s[part]["f1"]) for part in ("overlap_50ms", "hop_50ms", "grasps")),
+        ]
+        for name, s in scores.items()
+        if name != "cross_validation"
+    ]
+    if rows:
+        _table(("not trained on", "closures", "window F1, hop 150 ms", "hop 50 ms", "grasp F1"), rows)
     print(
-        f"F1 is the mean over the classes. Trained on {_listed(manifest['training']['kinds'])} closures, seed "
-        f"{manifest['seed']}: {path} ({manifest['onnx']['bytes'] / 1e3:.0f} kB), manifest {path.with_suffix('.json')}"
+        f"F1 is the mean over the classes. Method: {manifest['method']}; trained on "
+        f"{_listed(manifest['training']['kinds'])} closures, seed {manifest['seed']}: {path} "
+        f"({manifest['onnx']['bytes'] / 1e3:.0f} kB), manifest {path.with_suffix('.json')}"
     )
 
 
@@ -229,13 +321,44 @@ def _print_scores(result: dict[str, Any]) -> None:
                 _row("pooled", result[part]["pooled"]),
             ],
         )
+    print("Grasps")
+    late = result["latency"]["objects"]
+    _table(
+        (*_COLUMNS[:1], "grasps", *_COLUMNS[2:], "median latency, ms"),
+        [
+            [*_row(name, s), _milliseconds(late.get(name, {}).get("from_contact_median_s"))]
+            for name, s in result["grasps"]["objects"].items()
+        ]
+        + [
+            [
+                *_row("pooled", result["grasps"]["pooled"]),
+                _milliseconds(result["latency"]["pooled"]["from_contact_median_s"]),
+            ]
+        ],
+    )
     print(
-        "Confusion of the last (rows true, columns answered): "
+        "Confusion of windows, hop 50 ms (rows true, columns answered): "
         + "; ".join(
             f"{name} {counts}"
             for name, counts in zip(STIFFNESS_CLASSES, result["hop_50ms"]["pooled"]["confusion"], strict=True)
         )
     )
+    refused, error = result["not_sure"], result["reliability"]["expected_calibration_error"]
+    print(
+        f"Where no rule decides: {_percent(refused['part'])} not sure, {_percent(refused['right_when_sure'])} of the "
+        f"others right ({_percent(refused['right_if_forced'])} if forced); calibration error {error}."
+    )
+    stiff = result["stiffness"]["grasps"]
+    if stiff["count"]:
+        print(
+            f"Stiffness of {stiff['count']} grasps: {_percent(stiff['within_factor'])} within a factor "
+            f"{result['stiffness']['factor']}, interval (a factor {stiff['interval_factor']:.2f} either way) holds "
+            f"{_percent(stiff['covered'])}."
+        )
+
+
+def _milliseconds(value: float | None) -> str:
+    return "-" if value is None else f"{1e3 * value:.0f}"
 
 
 def main() -> int:

@@ -1,7 +1,7 @@
-"""The thesis' single-sample features, once per stream and once for whole arrays, bit for bit the same.
+"""Features, once per stream and once for whole arrays, bit for bit the same: of single samples and of windows.
 
-A sample is (motor current A, reference rad, encoder rad) at one instant (thesis P20). Three rules belong to
-it:
+A single sample is (motor current A, reference rad, encoder rad) at one instant (thesis P20); what a window adds
+(slopes, ranges, what the grasp has shown since its beginning) is in `window_features`. Three rules belong to both:
 
 - The current is the mean over the trailing 1/rate s, because the trained sensor averages too: a 1 kHz
   stream is brought down to the trained 30 Hz, a 30 Hz stream passes unchanged.
@@ -28,8 +28,15 @@ import numpy as np
 from hannes_description.errors import HannesError
 from numpy.typing import ArrayLike, NDArray
 
-FEATURE_VERSION = "single-sample/1"
-FEATURE_NAMES = ("motor_current", "reference_position", "encoder_position")
+from .window import WINDOW_NAMES, new_window_state, window_features, window_series
+
+SINGLE_SAMPLE = "single-sample/1"
+WINDOW = "window/1"
+FEATURES: Mapping[str, tuple[str, ...]] = {
+    SINGLE_SAMPLE: ("motor_current", "reference_position", "encoder_position"),
+    WINDOW: WINDOW_NAMES,
+}
+"""Names of the features by the version of their meaning; a version that changes its meaning changes its name."""
 CURRENTS = ("rectified", "signed")
 
 GAP = 0.25
@@ -63,12 +70,12 @@ class FeatureSpec:
     rate: float = 30.0
     void_current: float = 0.3
     mask: float = 0.2
-    version: str = FEATURE_VERSION
+    version: str = SINGLE_SAMPLE
 
     def __post_init__(self) -> None:
-        if self.version != FEATURE_VERSION:
+        if self.version not in FEATURES:
             raise HannesError(
-                f"Feature version {self.version!r} is not this code's, {FEATURE_VERSION!r}; train the "
+                f"Feature version {self.version!r} is none of this code's, {', '.join(FEATURES)}; train the "
                 "classifier again with `hannes stiffness train`."
             )
         if self.current not in CURRENTS:
@@ -87,6 +94,11 @@ class FeatureSpec:
         """Time between samples, s."""
         return 1.0 / self.rate
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the features, in their order."""
+        return FEATURES[self.version]
+
     def to_dict(self) -> dict[str, object]:
         """Plain types, for the manifest."""
         return asdict(self)
@@ -104,11 +116,10 @@ class FeatureSpec:
 
 @dataclass(frozen=True)
 class Sample:
-    """One feature sample: time s, values (current A, reference rad, encoder rad), and whether the rules
-    make it void."""
+    """One feature sample: time s, values in the order of the spec's names, and whether the rules make it void."""
 
     time: float
-    values: tuple[float, float, float]
+    values: tuple[float, ...]
     void: bool
 
 
@@ -117,7 +128,7 @@ class Features:
     """Feature samples of a whole stream.
 
     time      (m,) s
-    values    (m, 3) current A, reference rad, encoder rad, float32 (the precision of the trained file)
+    values    (m, k) in the order of the spec's names, float32 (the precision of the trained file)
     void      (m,) bool: below the void current, or in the start-up of a closure
     rejected  input samples dropped: not finite, not believable, or not later than the one before
     restarts  times the stream started afresh after a hole or a jump back
@@ -163,6 +174,8 @@ class FeatureStream:
         self._before: tuple[float, float] | None = None
         self._rising = False
         self._onset = -np.inf
+        self._grasp = new_window_state()
+        self._values = np.empty(len(WINDOW_NAMES))
 
     def reset(self) -> None:
         """Forget the stream; the counts stay."""
@@ -194,13 +207,23 @@ class FeatureStream:
         while self._window[0][0] <= oldest:
             self._window.popleft()
         tick = math.floor((time - self._anchor) / spec.period + _EARLY)
-        if tick > self._tick:
-            self._tick = tick
-            self._watch(time, reference)
         due = math.floor((time - self._anchor) / self._period + _EARLY)
-        if due <= self._due:
+        ticked, answers = tick > self._tick, due > self._due
+        self._tick, self._due = max(tick, self._tick), max(due, self._due)
+        if spec.version == WINDOW:
+            if not ticked and not answers:
+                return None
+            mean = float(np.mean(np.array([c for _, c in self._window])))
+            # An answer between two ticks leaves no trace, so that the features mean the same at any rate of answers.
+            state = self._grasp if ticked else self._grasp.copy()
+            blind = window_features(state, time, mean, reference, encoder, spec.mask, self._values)
+            if not answers:
+                return None
+            return Sample(time, tuple(self._values.tolist()), blind or abs(mean) < spec.void_current)
+        if ticked:
+            self._watch(time, reference)
+        if not answers:
             return None
-        self._due = due
         mean = float(np.mean(np.array([c for _, c in self._window])))
         void = abs(mean) < spec.void_current or time - self._onset < spec.mask
         return Sample(time, (mean, reference, encoder), void)
@@ -262,7 +285,9 @@ def extract(
         pieces.append(_extract_stretch(t_, i_, r_, q_, spec, period))
         start = stop
     if not pieces:
-        return Features(np.empty(0), np.empty((0, 3), np.float32), np.empty(0, bool), rejected, 0)
+        return Features(
+            np.empty(0), np.empty((0, len(spec.names)), np.float32), np.empty(0, bool), rejected, 0
+        )
     return Features(
         np.concatenate([p.time for p in pieces]),
         np.concatenate([p.values for p in pieces]),
@@ -282,6 +307,16 @@ def _extract_stretch(
 ) -> Features:
     """One stretch without holes, strictly forward in time."""
     watched, due = _ticks(t, spec.period), _ticks(t, period)
+    if spec.version == WINDOW:
+        use = np.union1d(watched, due)
+        first = np.searchsorted(t, t[use] - _AVERAGED * spec.period, side="right")
+        mean = np.array([np.mean(i[a : b + 1]) for a, b in zip(first, use, strict=True)])
+        values, blind = window_series(
+            t[use], mean, r[use], q[use], np.isin(use, watched), spec.mask, len(WINDOW_NAMES)
+        )
+        answers = np.isin(use, due)
+        void = blind | (np.abs(mean) < spec.void_current)
+        return Features(t[due], values[answers].astype(np.float32), void[answers])
     first = np.searchsorted(t, t[due] - _AVERAGED * spec.period, side="right")
     mean = np.array([np.mean(i[a : b + 1]) for a, b in zip(first, due, strict=True)])
 

@@ -1,9 +1,9 @@
-"""From a data set to a trained file, and from recordings to scores."""
+"""From a data set to a trained file, and from recordings to what they were closed on."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,47 +14,30 @@ from hannes_description.signals import STIFFNESS_CLASSES
 from hannes_sim.objects import OBJECTS, GraspObject
 from numpy.typing import NDArray
 
-from .classifier import StiffnessClassifier, TreeSettings, cross_validate, fit, save
-from .dataset import Closure, Dataset, Scene, closure_of, kind_of, label
-from .features import Features, FeatureSpec, extract
-from .scoring import HOPS, score, score_closures
+from .classifier import StiffnessClassifier, save
+from .dataset import Closure, Dataset, Scene, closure_of, closures_of, kind_of
+from .evaluation import answer, kind_name, scores_of, split_grasps
+from .features import SINGLE_SAMPLE, FeatureSpec
+from .models import (
+    METHODS,
+    THESIS_METHOD,
+    Calibration,
+    TrainingData,
+    TreeSettings,
+    apply_rules,
+    cross_validate,
+    fit,
+    fit_estimator,
+    log_loss,
+    method_of,
+)
+from .scoring import HOPS, score_closures
 
-
-@dataclass(frozen=True)
-class Answered:
-    """The answers to one closure or recording: object name, sample times (n,) s, true and answered class (n,)."""
-
-    object: str
-    time: NDArray[np.float64]
-    truth: NDArray[np.int64]
-    answer: NDArray[np.int64]
-
-
-def scores_of(answered: Sequence[Answered]) -> dict[str, Any]:
-    """Scores as plain types: of single samples, and of the thesis' windows in both readings (per object and pooled)."""
-    if not answered:
-        raise HannesError("There is no closure to score.")
-    out: dict[str, Any] = {
-        "samples": score(
-            np.concatenate([a.truth for a in answered]), np.concatenate([a.answer for a in answered])
-        ).to_dict()
-    }
-    rows = [(a.object, a.time, a.truth, a.answer) for a in answered]
-    return out | {name: score_closures(rows, hop).to_dict() for name, hop in HOPS.items()}
-
-
-def answer(
-    classifier: StiffnessClassifier, closures: Iterable[Closure], *, by_kind: bool = False
-) -> list[Answered]:
-    """What the classifier says to measured closures; `by_kind` pools the objects of a kind."""
-    out = []
-    for closure in closures:
-        f = extract(closure.time, closure.current, closure.reference, closure.encoder, classifier.spec)
-        name = closure.scene.kind if by_kind else closure.scene.object
-        out.append(
-            Answered(name, f.time, label(f, closure.scene.kind), classifier.classify(f.values, f.void))
-        )
-    return out
+SURE = 0.7
+"""Least probability of a sure answer; as they are calibrated, so often are the least sure answers right."""
+COMPARED = ("objects", "hands")
+"""Groupings of the cross-validation that methods are compared by."""
+BEST = "best"
 
 
 def train(
@@ -62,68 +45,131 @@ def train(
     path: str | Path,
     *,
     seed: int,
-    spec: FeatureSpec | None = None,
+    method: str = THESIS_METHOD,
+    current: str = "rectified",
     settings: TreeSettings | None = None,
     held_out: Mapping[str, Dataset] | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Path:
-    """Train the bagged trees on the data set, score them and write `path` (.onnx) with its manifest.
+    """Train on the data set, score by cross-validation and write `path` (.onnx) with its manifest.
 
-    seed      of the trees and of the folds
+    seed      of the models and of the folds
+    method    a name of METHODS, or "best": all are compared, and the best one on windows is taken
+    current   "rectified" or "signed"
     held_out  further data sets by name, none of whose closures was trained on; their scores go into the manifest
     say       told what is going on, one sentence at a time
-    Returns the path of the ONNX file.
+
+    The thesis' method is trained as the thesis did: labels by the void current alone (P19), no calibration, no
+    estimate. Returns the path of the ONNX file.
     """
-    spec, settings = spec or FeatureSpec(), settings or TreeSettings()
-    data = dataset.training_data(spec)
-    say(
-        f"{settings.folds}-fold cross-validation over {len(dataset.closures)} closures, {len(data.labels)} samples."
-    )
-    folds = cross_validate(data, seed=seed, settings=settings)
-    scores: dict[str, Any] = {
-        "cross_validation": _summary(scores_of(_split(dataset, dataset.features(spec), folds)))
+    settings = settings or TreeSettings()
+    names = tuple(METHODS) if method == BEST else (method,)
+    specs = {name: FeatureSpec(current=current, version=method_of(name).features) for name in names}
+    data = {
+        (spec.version, contact): dataset.training_data(spec, contact=contact)
+        for spec in specs.values()
+        for contact in ([False] if method == THESIS_METHOD else [True])
     }
-    say("Training on all of them.")
-    trees = fit(data, seed=seed, settings=settings)
-    counts = {name: int(np.count_nonzero(data.labels == k)) for k, name in enumerate(STIFFNESS_CLASSES)}
-    training = {**dataset.manifest, "samples": counts, "void_by_rule": int(np.count_nonzero(data.void))}
-    path = save(trees, path, spec=spec, seed=seed, settings=settings, training=training, scores=scores)
+    scores: dict[str, Any] = {}
+    out_of_fold: dict[str, NDArray[np.float64]] = {}
+    groupings = ("closures",) if method == THESIS_METHOD else COMPARED
+    for name in names:
+        used = data[specs[name].version, method != THESIS_METHOD]
+        scores[name] = {"title": METHODS[name].title, "samples": len(used.labels)}
+        for grouping in groupings:
+            say(f"{METHODS[name].title}: {settings.folds} folds, no {grouping} in two of them.")
+            held = cross_validate(used, seed=seed, settings=settings, method=name, grouping=grouping)
+            if grouping == groupings[0]:
+                out_of_fold[name] = held
+            scores[name][grouping] = _validation(dataset, used, specs[name], held)
+    chosen = names[0]
+    if method == BEST:
+        windows = [n for n in names if METHODS[n].features != SINGLE_SAMPLE]
+        chosen = min(windows, key=lambda n: sum(scores[n][g]["log_loss"] for g in COMPARED))
+    spec = specs[chosen]
+    used = data[spec.version, method != THESIS_METHOD]
+    say(f"Training {METHODS[chosen].title} on all of them.")
+    model = fit(used, seed=seed, settings=settings, method=chosen)
+    calibration = estimator = None
+    if method != THESIS_METHOD:
+        open_ = ~used.void
+        calibration = Calibration.fit(out_of_fold[chosen][open_], used.labels[open_])
+        say("Training the regression of the stiffness.")
+        estimator = fit_estimator(used, seed=seed, folds=settings.folds)
+    counts = {name: int(np.count_nonzero(used.labels == k)) for k, name in enumerate(STIFFNESS_CLASSES)}
+    training = {
+        **{k: v for k, v in dataset.manifest.items() if k != "parts"},
+        "samples": counts,
+        "void_by_rule": int(np.count_nonzero(used.void)),
+    }
+    content: dict[str, Any] = {
+        "method": METHODS[chosen].title,
+        "spec": spec,
+        "seed": seed,
+        "settings": asdict(settings),
+        "training": training,
+        "calibration": calibration,
+        "sure": 0.0 if method == THESIS_METHOD else SURE,
+        "estimator": estimator,
+    }
+    result: dict[str, Any] = {"cross_validation": scores}
+    path = save(model, path, scores=result, **content)
     if held_out:
         classifier = StiffnessClassifier.load(path)
         for name, other in held_out.items():
             say(f"Scoring {len(other.closures)} closures that were not trained on ({name}).")
-            scores[name] = {
-                **_summary(scores_of(answer(classifier, other.closures, by_kind=True))),
-                "closures": len(other.closures),
+            result[name] = {
+                **summary(scores_of(answer(classifier, other.closures), kind_name)),
                 "hands": other.manifest.get("hands"),
                 "seed": other.manifest.get("seed"),
             }
-        save(trees, path, spec=spec, seed=seed, settings=settings, training=training, scores=scores)
+        save(model, path, scores=result, **content)
     return path
 
 
-def _split(dataset: Dataset, features: Sequence[Features], answers: NDArray[np.int64]) -> list[Answered]:
-    parts = np.split(answers, np.cumsum([len(f.time) for f in features])[:-1])
-    return [
-        Answered(c.scene.kind, f.time, label(f, c.scene.kind), a)
-        for c, f, a in zip(dataset.closures, features, parts, strict=True)
+def _validation(
+    dataset: Dataset, data: TrainingData, spec: FeatureSpec, held: NDArray[np.float64]
+) -> dict[str, Any]:
+    """Scores of held-out probabilities: the loss where no rule decides, and the windows."""
+    open_ = ~data.void
+    truth, said = data.labels, np.argmax(apply_rules(held, data.void), axis=1)
+    count = np.bincount(data.closures, minlength=len(dataset.closures))
+    cut = np.cumsum(count)[:-1]
+    times = [f.time for f in dataset.features(spec)]
+    rows = [
+        (c.scene.kind, t, a, b)
+        for c, t, a, b in zip(dataset.closures, times, np.split(truth, cut), np.split(said, cut), strict=True)
     ]
+    return {
+        "log_loss": round(log_loss(held[open_], truth[open_]), 5),
+        "right": round(float(np.mean(said[open_] == truth[open_])), 5),
+        **{name: score_closures(rows, hop).pooled.to_dict() for name, hop in HOPS.items()},
+    }
 
 
-def _summary(scores: Mapping[str, Any]) -> dict[str, Any]:
+def summary(scores: Mapping[str, Any]) -> dict[str, Any]:
     """Pooled scores only: the file ships, and the per-object ones can be made again."""
-    return {"samples": scores["samples"], **{name: scores[name]["pooled"] for name in HOPS}}
+    pooled = {name: scores[name]["pooled"] for name in (*HOPS, "grasps", "latency")}
+    return {
+        "closures": scores["closures"],
+        "samples": scores["samples"],
+        **pooled,
+        **{name: scores[name] for name in ("not_sure", "stiffness")},
+    }
 
 
 def scene_of(recording: Recording, kind: str | None = None) -> Scene:
     """What a recording says it was closed on (metadata `object`, a name or an object's data), or the given kind."""
     said = recording.metadata.get("object")
     name = Path(recording.source).name or "recording"
+    known = None
+    if isinstance(said, Mapping):
+        known = GraspObject.from_dict(said)
+    elif said in OBJECTS:
+        known = OBJECTS[str(said)]
     if kind is None:
-        if isinstance(said, Mapping):
-            kind = kind_of(GraspObject.from_dict(said))
-        elif said in OBJECTS:
-            kind = kind_of(OBJECTS[str(said)])
+        if isinstance(said, Mapping) or said in OBJECTS:
+            kind = kind_of(known)
         elif said in STIFFNESS_CLASSES:
             kind = str(said)
         else:
@@ -135,20 +181,24 @@ def scene_of(recording: Recording, kind: str | None = None) -> Scene:
     if kind not in STIFFNESS_CLASSES:
         raise HannesError(f"Kind {kind!r} is unknown; valid are {', '.join(STIFFNESS_CLASSES)}.")
     label_ = said if isinstance(said, str) else name
-    # The true object is not known to the classifier's scene; only its kind counts for the scores.
-    return Scene(object=label_, kind=kind, grasp=None if kind == STIFFNESS_CLASSES[0] else GraspObject())
+    # Where the object itself is not known, its kind counts alone.
+    same = known is not None and kind_of(known) == kind
+    grasp = None if kind == STIFFNESS_CLASSES[0] else known if same else GraspObject()
+    return Scene(object=label_, kind=kind, grasp=grasp, known=same or grasp is None)
+
+
+def measured_closures(recording: Recording, kind: str | None = None) -> list[Closure]:
+    """The closures of a recording, one a grasp; a bag of a data set says itself what each is on."""
+    if kind is None and "scenes" in recording.metadata:
+        return closures_of(recording)
+    names = ("motor_current", "reference_position", "encoder_position", "grip_force")
+    channels = {n: (recording[n].time, recording[n].values) for n in names if n in recording}
+    return split_grasps(closure_of(channels, scene_of(recording, kind)))
 
 
 def evaluate(
-    classifier: StiffnessClassifier, recordings: Iterable[tuple[Recording, Scene]]
+    classifier: StiffnessClassifier, recordings: Iterable[tuple[Recording, str | None]]
 ) -> dict[str, Any]:
-    """Scores of the classifier on recordings, each with its truth."""
-    closures = []
-    for recording, scene in recordings:
-        channels = {
-            name: (recording[name].time, recording[name].values)
-            for name in ("motor_current", "reference_position", "encoder_position")
-            if name in recording
-        }
-        closures.append(closure_of(channels, scene))
+    """Scores of the classifier on recordings, each with its kind where it does not say it."""
+    closures = [c for recording, kind in recordings for c in measured_closures(recording, kind)]
     return scores_of(answer(classifier, closures))

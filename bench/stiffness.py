@@ -1,0 +1,291 @@
+"""How good the stiffness classifier is: the targets beside what was measured, the thesis' method in the same run.
+
+    python bench/stiffness.py                  everything, about a quarter of an hour on one core
+    python bench/stiffness.py --closures 13    a third of the closures, without the ablations: about two minutes
+    python bench/stiffness.py --write          also put the tables into docs/stiffness.md, the pictures beside it
+
+Every seed here is another than those of the training. Data sets are kept in --work, so that a second run goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from hannes_description.model import Model
+from hannes_sim.measurement import Sensors
+from hannes_sim.objects import GraspObject
+from hannes_stiffness.classifier import StiffnessClassifier
+from hannes_stiffness.dataset import Closure, Dataset, bench_scenes, draw_scenes, make_dataset
+from hannes_stiffness.evaluation import answer, scores_of
+from hannes_stiffness.features import FeatureStream
+from hannes_stiffness.models import TreeSettings
+from hannes_stiffness.training import train
+
+SEED = 2026
+PENTAGONS = {
+    "rigid pentagon": GraspObject("pentagon", 0.065, 40e3, 20.0),
+    "soft pentagon": GraspObject("pentagon", 0.065, 400.0, 2.0),
+}
+MULTIBODY, REDUCED = "nominal_mujoco", "nominal"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+# Signed, otherwise like the thesis' log: what rectifying costs.
+SIGNED = Sensors(current_rectified=False)
+
+
+def percent(value: float | None) -> str:
+    return "-" if value is None else f"{100.0 * value:.1f} %"
+
+
+def milliseconds(value: float | None) -> str:
+    return "never" if value is None else f"{1e3 * value:.0f} ms"
+
+
+def cost_of_an_answer(classifier: StiffnessClassifier, closure: Closure) -> tuple[float, float]:
+    """Median and 99th percentile of the time from a sample to its answer, s, as the node computes it."""
+    stream, times = FeatureStream(classifier.spec), []
+    rows = zip(closure.time, closure.current, closure.reference, closure.encoder, strict=True)
+    for k, row in enumerate([*rows] * 10):
+        values = (float(row[0]) + 60.0 * (k // len(closure.time)), *map(float, row[1:]))
+        start = time.perf_counter()
+        sample = stream.push(*values)
+        if sample is not None:
+            answers = classifier.answer([sample.values], [sample.void])
+            answers.sure(classifier.least)
+            times.append(time.perf_counter() - start)
+    return float(np.median(times)), float(np.quantile(times, 0.99))
+
+
+def loading_time() -> float:
+    """Time to load the default classifier, s, once onnxruntime itself is there."""
+    StiffnessClassifier.load()
+    start = time.perf_counter()
+    StiffnessClassifier.load()
+    return time.perf_counter() - start
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--closures", type=int, default=39, help="closures on each of the ten objects")
+    parser.add_argument("--hands", type=int, default=13, help="hands of the population")
+    parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "hannes_bench_stiffness")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--ablations", type=int, default=1200, help="closures to train each ablation on; 0: none")
+    parser.add_argument("--write", action="store_true", help="put tables and pictures into docs")
+    parser.add_argument("--json", type=Path, help="write all scores to this file")
+    given = parser.parse_args()
+    ablations = given.ablations if given.closures >= 39 else 0
+
+    models = {name: Model.load(name) for name in (MULTIBODY, REDUCED)}
+
+    def test(model: str, what: str, sensors: Sensors | None = None) -> Dataset:
+        scenes = bench_scenes(given.hands, given.closures, model=models[model].name)
+        extra = {} if sensors is None else {"sensors": sensors}
+        folder = given.work / f"{what}_{given.hands}_{given.closures}"
+        return make_dataset(scenes, models[model], seed=SEED, jobs=given.jobs, folder=folder, **extra)
+
+    def say(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    say("Ten objects, multi-body plant.")
+    ten = test(MULTIBODY, "ten").closures
+    say("Ten objects, reduced plant.")
+    other = test(REDUCED, "ten_reduced").closures
+    say("Pentagons.")
+    pentagons = make_dataset(
+        bench_scenes(1, 5, model=models[MULTIBODY].name, varied=False, objects=PENTAGONS),
+        models[MULTIBODY], seed=SEED, jobs=given.jobs, folder=given.work / "pentagons",
+    ).closures  # fmt: skip
+    say("Unseen objects of any stiffness.")
+    wide = make_dataset(
+        draw_scenes(400, SEED, hands=100, models=[models[MULTIBODY].name], variety="wide"),
+        models[MULTIBODY], seed=SEED, jobs=given.jobs, folder=given.work / "wide",
+    ).closures  # fmt: skip
+
+    window, thesis = StiffnessClassifier.load("window"), StiffnessClassifier.load("baseline")
+    answered = answer(window, ten)
+    results = {
+        "ten": scores_of(answered),
+        "ten, thesis' method": scores_of(answer(thesis, ten)),
+        "reduced": scores_of(answer(window, other)),
+        "reduced, thesis' method": scores_of(answer(thesis, other)),
+        "pentagons": scores_of(answer(window, pentagons)),
+        "pentagons, thesis' method": scores_of(answer(thesis, pentagons)),
+        "wide": scores_of(answer(window, wide)),
+    }
+    median, slowest = cost_of_an_answer(window, ten[0])
+    loading = loading_time()
+
+    r, t = results["ten"], results["ten, thesis' method"]
+    p, q = results["pentagons"], results["pentagons, thesis' method"]
+    stiff = r["stiffness"]
+
+    def f1(scores: dict, part: str) -> float:
+        return scores[part]["pooled"]["f1"]
+
+    def row(what: str, target: str, ours: str, theirs: str, met: bool) -> list[str]:
+        return [what, target, ours, theirs, "yes" if met else "**no**"]
+
+    late = r["latency"]["pooled"]
+    targets = table(
+        ("test", "target", "measured", "thesis' method, same run", "met"),
+        [
+            row("R17: pentagons, nominal hand, window F1 (hop 150 ms)", "100 %", percent(f1(p, "overlap_50ms")),
+                percent(f1(q, "overlap_50ms")), f1(p, "overlap_50ms") == 1.0),
+            row("R17, hop 50 ms", "100 %", percent(f1(p, "hop_50ms")), percent(f1(q, "hop_50ms")),
+                f1(p, "hop_50ms") == 1.0),
+            row("ten objects, pooled window F1 (hop 150 ms)", ">= 95 %", percent(f1(r, "overlap_50ms")),
+                percent(f1(t, "overlap_50ms")), f1(r, "overlap_50ms") >= 0.95),
+            row("the same, hop 50 ms", ">= 95 %", percent(f1(r, "hop_50ms")), percent(f1(t, "hop_50ms")),
+                f1(r, "hop_50ms") >= 0.95),
+            row("the same, truth by the void current alone (hop 150 ms)", ">= 95 %",
+                percent(r["overlap_50ms"]["by_rule_alone"]["f1"]), percent(t["overlap_50ms"]["by_rule_alone"]["f1"]),
+                r["overlap_50ms"]["by_rule_alone"]["f1"] >= 0.95),
+            row("ten objects, grasps answered rightly", ">= 98 %", percent(r["grasps"]["pooled"]["accuracy"]),
+                percent(t["grasps"]["pooled"]["accuracy"]), r["grasps"]["pooled"]["accuracy"] >= 0.98),
+            row("latency from the first contact, median", "<= 100 ms", milliseconds(late["from_contact_median_s"]),
+                milliseconds(t["latency"]["pooled"]["from_contact_median_s"]),
+                (late["from_contact_median_s"] or 9.0) <= 0.1),
+            row("latency from the first sample above 0.3 A with contact, median", "<= 100 ms",
+                milliseconds(late["from_void_current_median_s"]),
+                milliseconds(t["latency"]["pooled"]["from_void_current_median_s"]),
+                (late["from_void_current_median_s"] if late["from_void_current_median_s"] is not None else 9.0) <= 0.1),
+            row("stiffness of a grasp within a factor 1.5", ">= 90 %", percent(stiff["grasps"]["within_factor"]),
+                "none", (stiff["grasps"]["within_factor"] or 0.0) >= 0.9),
+            row("interval holds the truth, per sample", "90 %", percent(stiff["samples"]["covered"]), "none",
+                (stiff["samples"]["covered"] or 0.0) >= 0.895),
+            row("interval holds the truth, unseen objects of any stiffness, per sample", "90 %",
+                percent(results["wide"]["stiffness"]["samples"]["covered"]), "none",
+                (results["wide"]["stiffness"]["samples"]["covered"] or 0.0) >= 0.895),
+            row("one answer: median (99th percentile)", "<= 1 ms",
+                f"{1e3 * median:.2f} ms ({1e3 * slowest:.2f} ms)", "", slowest <= 1e-3),
+            row("loading the classifier", "< 100 ms", f"{1e3 * loading:.0f} ms", "", loading < 0.1),
+        ],
+    )  # fmt: skip
+    hidden = "; ".join(
+        f"{name}: {s['hidden']}" for name, s in r["grasps"]["objects"].items() if s["hidden"]
+    )
+    objects = table(
+        ("object", "window F1, hop 150 ms", "thesis' method", "grasps right", "thesis' method", "median latency",
+         "from 0.3 A"),
+        [
+            [name, percent(r["overlap_50ms"]["objects"][name]["f1"]), percent(t["overlap_50ms"]["objects"][name]["f1"]),
+             percent(g["accuracy"]), percent(t["grasps"]["objects"][name]["accuracy"]),
+             milliseconds(r["latency"]["objects"].get(name, {}).get("from_contact_median_s")),
+             milliseconds(r["latency"]["objects"].get(name, {}).get("from_void_current_median_s"))]
+            for name, g in r["grasps"]["objects"].items()
+        ],
+    )  # fmt: skip
+    objects += f"\n\nGrasps whose object never raised the current above 0.3 A, so that void is right: {hidden or 0}."
+    where = table(
+        ("data", "window F1, hop 150 ms", "thesis' method", "grasps right", "not sure", "right when sure",
+         "calibration error", "stiffness within 1.5", "median factor", "interval holds, per sample"),
+        [
+            [title, percent(f1(results[name], "overlap_50ms")),
+             percent(f1(results[beside], "overlap_50ms")) if beside else "-",
+             percent(results[name]["grasps"]["pooled"]["accuracy"]), percent(results[name]["not_sure"]["part"]),
+             percent(results[name]["not_sure"]["right_when_sure"]),
+             str(results[name]["reliability"]["expected_calibration_error"]),
+             percent(results[name]["stiffness"]["grasps"]["within_factor"]),
+             str(results[name]["stiffness"]["grasps"]["median_factor"]),
+             percent(results[name]["stiffness"]["samples"]["covered"])]
+            for title, name, beside in (
+                ("ten objects, multi-body plant", "ten", "ten, thesis' method"),
+                ("ten objects, reduced plant", "reduced", "reduced, thesis' method"),
+                ("unseen objects, 0.1 to 100 kN/m, all profiles", "wide", ""),
+            )
+        ],
+    )  # fmt: skip
+    decades = table(
+        ("stiffness", "grasps", "within 1.5", "median factor", "interval holds", "interval, factor either way"),
+        [
+            [name, str(s["count"]), percent(s["within_factor"]), str(s["median_factor"]), percent(s["covered"]),
+             str(s["interval_factor"])]
+            for name, s in results["wide"]["stiffness"]["by_stiffness"].items() if s["count"]
+        ],
+    )  # fmt: skip
+    parts = {"targets": targets, "objects": objects, "where": where, "stiffness": decades}
+    if ablations:
+        parts["ablations"] = ablation_table(given, models, ten, ablations, results, say)
+    for name, text in parts.items():
+        print(f"\n{name}\n{text}")
+    if given.json:
+        given.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    if given.write:
+        from hannes_stiffness.pictures import draw
+
+        for path in draw(answered, r, DOCS / "stiffness"):
+            say(f"Picture: {path}")
+        write(DOCS / "stiffness.md", parts)
+    return 0
+
+
+def ablation_table(given, models, ten, closures, results, say) -> str:  # type: ignore[no-untyped-def]
+    """Each one trained on as many closures, tested on the ten objects."""
+    names = [models[MULTIBODY].name] * 3 + [models[REDUCED].name]
+    both = (models[MULTIBODY], models[REDUCED])
+
+    def data(variety: str, sensors: Sensors | None = None) -> Dataset:
+        varied = variety == "wide"
+        scenes = draw_scenes(
+            closures, SEED + 1, hands=300 if varied else 1, models=names, variety=variety,
+            objects=600 if varied else None,
+        )  # fmt: skip
+        extra = {} if sensors is None else {"sensors": sensors}
+        folder = given.work / f"train_{variety}{'' if sensors is None else '_signed'}_{closures}"
+        return make_dataset(scenes, *both, seed=SEED + 1, jobs=given.jobs, folder=folder, **extra)
+
+    signed = make_dataset(
+        bench_scenes(given.hands, given.closures, model=models[MULTIBODY].name),
+        models[MULTIBODY], seed=SEED, jobs=given.jobs, sensors=SIGNED,
+        folder=given.work / f"ten_signed_{given.hands}_{given.closures}",
+    ).closures  # fmt: skip
+    rows = []
+    for title, variety, method, current, sensors, tests in (
+        ("windows, randomised, rectified", "wide", "forest", "rectified", None, ten),
+        ("single samples instead of windows", "wide", "thesis", "rectified", None, ten),
+        ("two stiffnesses, nominal hand instead of randomised", "two", "forest", "rectified", None, ten),
+        ("single samples and two stiffnesses (the thesis)", "two", "thesis", "rectified", None, ten),
+        ("signed instead of rectified current", "wide", "forest", "signed", SIGNED, signed),
+    ):
+        say(f"Ablation: {title}.")
+        path = train(
+            data(variety, sensors), given.work / "ablation.onnx", seed=SEED, method=method, current=current,
+            settings=TreeSettings(folds=3),
+        )  # fmt: skip
+        scores = scores_of(answer(StiffnessClassifier.load(path), tests))
+        results[f"ablation: {title}"] = scores
+        rows.append(
+            [title, percent(scores["overlap_50ms"]["pooled"]["f1"]), percent(scores["hop_50ms"]["pooled"]["f1"]),
+             percent(scores["grasps"]["pooled"]["accuracy"]),
+             milliseconds(scores["latency"]["pooled"]["from_contact_median_s"]),
+             percent(scores["stiffness"]["grasps"].get("within_factor"))]
+        )  # fmt: skip
+    head = ("trained on", "window F1, hop 150 ms", "hop 50 ms", "grasps right", "median latency", "N/m within 1.5")
+    return table(head, rows) + f"\n\nBagged trees, each trained on {closures} closures."
+
+
+def write(path: Path, parts: dict[str, str]) -> None:
+    """Replace what stands between the markers of each part."""
+    text = path.read_text(encoding="utf-8")
+    for name, part in parts.items():
+        begin, end = f"<!-- {name}: bench/stiffness.py -->", f"<!-- end of {name} -->"
+        if begin in text and end in text:
+            head, rest = text.split(begin, 1)
+            text = f"{head}{begin}\n{part}\n{end}{rest.split(end, 1)[1]}"
+    path.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

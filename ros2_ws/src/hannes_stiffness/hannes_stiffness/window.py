@@ -1,0 +1,251 @@
+"""Features of a window and of the grasp so far: what one sample cannot tell, in one compiled function.
+
+The machine code is the same for a stream (one call a sample) and for whole arrays (`window_series`).
+
+Why these. A motor that presses an object slowly is in balance, kt i = M(friction, springs) + k (q - q_contact): the
+current over the encoder's increment is the object's stiffness in series with the wire, whatever the hand's own
+friction M is, and what the current was before the contact is M. So a closure keeps
+
+- its free level, the mean of the load current while the hand still closed freely. The load current is the current less
+  what the nominal hand needs to accelerate, to turn and to stretch its springs (`INERTIA`, `VISCOUS`, `SPRING`), so
+  that a closure's start is not taken for an object;
+- its contact, the last sample at which the load current was within `LIFT` of that level;
+- the line load current over encoder since the contact, while the encoder goes on closing (least squares), its steepest
+  parts, and how far the two have come.
+
+A closure begins where the reference rises after it had fallen by `FALL` (a ripple is no new closure). Slopes are given
+as log(1 + x / scale) with the sign of x: they range over three decades.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+WINDOW_NAMES = (
+    "current",
+    "reference",
+    "encoder",
+    "current_mean",
+    "current_slope",
+    "current_step",
+    "current_range",
+    "encoder_velocity",
+    "reference_velocity",
+    "tracking_error",
+    "tracking_error_rate",
+    "current_per_encoder",
+    "current_per_encoder_step",
+    "free_level",
+    "above_contact",
+    "contact_encoder",
+    "contact_velocity",
+    "time_since_contact",
+    "travel_since_contact",
+    "rise_per_travel",
+    "loading_line",
+    "steepest_slope",
+    "steepest_per_encoder",
+    "largest_rise",
+    "largest_travel",
+    "loading_share",
+    "load_current",
+    "load_above_free",
+    "load_rise",
+    "load_secant",
+    "acceleration",
+    "closing_time",
+)
+"""Currents A; angles rad at the pulley; velocities rad/s; times s; per-encoder figures and slopes as logarithms."""
+
+SAMPLES = 7
+"""Samples of a window: 200 ms at 30 Hz."""
+LIFT = 0.05
+"""Rise of the load current above the free level, A, from which there is a load."""
+INERTIA, VISCOUS, SPRING = 1.55e-3, 3.3e-3, 9.4e-3
+"""Current of a free closure per rad/s2, rad/s and rad: least squares over closures of both nominal hands on nothing."""
+FORGET = 0.25
+"""Weight of the newest sample in the free level."""
+FALL = 3.0
+"""Fall of the reference, rad, after which a rise is a new closure: a fifth of a full one."""
+LONGEST = 2.0
+"""Longest time since the contact that is told apart, s."""
+_RISES, _RESTS = 0.5, 0.05
+"""Rates of the reference, rad/s, above which it rises and below which it may rise again (hysteresis)."""
+_CLOSES = 0.3
+"""Encoder velocity, rad/s, above which the hand closes."""
+_SLOPE, _RATIO = 0.2, 0.01
+"""Scales of the logarithms: A/s, A/rad."""
+
+# Places in the state
+_COUNT, _RISING, _PEAK, _ONSET, _FREE, _LOADED, _Q0, _I0, _T0, _V0, _STEEP, _STEEP_Q, _RISE, _TRAVEL, _N, _SQ, _SI, \
+    _SQQ, _SQI, _SEEN, _LOAD0, _LOAD_RISE = range(22)  # fmt: skip
+_RING = 22
+STATE = _RING + 4 * SAMPLES
+
+
+def new_window_state() -> NDArray[np.float64]:
+    """The state before the first sample."""
+    state = np.zeros(STATE)
+    _begin(state, -np.inf, -np.inf)
+    return state
+
+
+@njit(cache=True)
+def _begin(s: Any, onset: float, peak: float) -> None:
+    """A closure begins: forget the last one's grasp."""
+    s[_ONSET], s[_PEAK] = onset, peak
+    s[_FREE] = 0.0
+    for k in range(_LOADED, _RING):
+        s[k] = 0.0
+
+
+@njit(cache=True)
+def _logarithm(x: float, scale: float) -> float:
+    return math.copysign(math.log1p(abs(x) / scale), x)
+
+
+@njit(cache=True)
+def window_features(s: Any, t: float, i: float, r: float, q: float, mask: float, out: Any) -> bool:
+    """Take one sample into the state s and write its features (len(WINDOW_NAMES),) to out.
+
+    t s; i A; r, q rad; mask s. True where the start of a closure makes the sample void.
+    """
+    n = int(s[_COUNT])
+    if n > 0:
+        last = _RING + 4 * ((n - 1) % SAMPLES)
+        rate = (r - s[last + 2]) / (t - s[last])
+        if rate > _RISES and s[_RISING] == 0.0:
+            s[_RISING] = 1.0
+            if s[_PEAK] - s[last + 2] >= FALL or s[_ONSET] == -np.inf:
+                _begin(s, t, r)
+        elif rate <= _RESTS:
+            s[_RISING] = 0.0
+    s[_PEAK] = max(s[_PEAK], r)
+    at = _RING + 4 * (n % SAMPLES)
+    s[at], s[at + 1], s[at + 2], s[at + 3] = t, i, r, q
+    n += 1
+    s[_COUNT] = n
+    m = min(n, SAMPLES)
+
+    # The window: means, least-squares slopes over time and over the encoder, range
+    mt = mi = mr = mq = 0.0
+    low, high = 1e9, -1e9
+    for k in range(m):
+        a = _RING + 4 * ((n - 1 - k) % SAMPLES)
+        mt += s[a]
+        mi += s[a + 1]
+        mr += s[a + 2]
+        mq += s[a + 3]
+        low, high = min(low, s[a + 1]), max(high, s[a + 1])
+    mt, mi, mr, mq = mt / m, mi / m, mr / m, mq / m
+    tt = ti = tr = tq = qq = qi = 0.0
+    for k in range(m):
+        a = _RING + 4 * ((n - 1 - k) % SAMPLES)
+        dt, di, dr, dq = s[a] - mt, s[a + 1] - mi, s[a + 2] - mr, s[a + 3] - mq
+        tt += dt * dt
+        ti += dt * di
+        tr += dt * dr
+        tq += dt * dq
+        qq += dq * dq
+        qi += dq * di
+    slope = velocity = reference_velocity = step = step_q = 0.0
+    if m > 1:
+        slope, reference_velocity, velocity = ti / tt, tr / tt, tq / tt
+        b = _RING + 4 * ((n - 2) % SAMPLES)
+        step = (i - s[b + 1]) / (t - s[b])
+        # A hundredth of a radian is thirty counts: below it the encoder stands, and the ratio says nothing more.
+        step_q = (i - s[b + 1]) / max(abs(q - s[b + 3]), 0.01)
+    ratio = qi / max(qq, m * 1e-4)
+
+    # Velocity and acceleration by a parabola through the newest samples, in the middle of the last step, which is what
+    # an averaged current belongs to.
+    speed, acceleration = velocity, 0.0
+    if m >= 4:
+        used = min(m, 5)
+        s1 = s2 = s3 = s4 = y0 = y1 = y2 = 0.0
+        for k in range(used):
+            a = _RING + 4 * ((n - 1 - k) % SAMPLES)
+            x, y = s[a] - t, s[a + 3] - q
+            s1 += x
+            s2 += x * x
+            s3 += x * x * x
+            s4 += x * x * x * x
+            y0 += y
+            y1 += x * y
+            y2 += x * x * y
+        c2, c3, c4 = s2 - s1 * s1 / used, s3 - s1 * s2 / used, s4 - s2 * s2 / used
+        d1, d2 = y1 - s1 * y0 / used, y2 - s2 * y0 / used
+        determinant = c2 * c4 - c3 * c3
+        if determinant > 1e-18:
+            curve = (c2 * d2 - c3 * d1) / determinant
+            back = 0.5 * (s[_RING + 4 * ((n - 2) % SAMPLES)] - t)
+            acceleration = 2.0 * curve
+            speed = (c4 * d1 - c3 * d2) / determinant + acceleration * back
+    load = abs(i) - INERTIA * acceleration - VISCOUS * speed - SPRING * q
+
+    blind = t - s[_ONSET] < mask
+    if not blind:
+        first = s[_SEEN] == 0.0
+        s[_SEEN] = 1.0
+        if first:
+            s[_FREE] = load
+        above = load - s[_FREE]
+        if first or (above < LIFT and (s[_LOADED] == 0.0 or velocity > _CLOSES)):
+            if velocity > _CLOSES:
+                s[_FREE] += FORGET * above
+            s[_LOADED] = 0.0
+            s[_Q0], s[_I0], s[_T0], s[_V0], s[_LOAD0] = q, abs(i), t, velocity, load
+            s[_STEEP] = s[_STEEP_Q] = s[_RISE] = s[_TRAVEL] = s[_LOAD_RISE] = 0.0
+            s[_N], s[_SQ], s[_SI], s[_SQQ], s[_SQI] = 1.0, 0.0, 0.0, 0.0, 0.0
+        elif q - s[_Q0] >= s[_TRAVEL] or load - s[_LOAD0] > s[_LOAD_RISE]:
+            s[_LOADED] = 1.0
+            x, y = q - s[_Q0], load - s[_LOAD0]
+            s[_TRAVEL], s[_LOAD_RISE] = max(s[_TRAVEL], x), max(s[_LOAD_RISE], y)
+            s[_RISE] = max(s[_RISE], abs(i) - s[_I0])
+            s[_STEEP] = max(s[_STEEP], max(slope, step))
+            s[_STEEP_Q] = max(s[_STEEP_Q], ratio)
+            s[_N] += 1.0
+            s[_SQ] += x
+            s[_SI] += y
+            s[_SQQ] += x * x
+            s[_SQI] += x * y
+    number = max(s[_N], 1.0)
+    spread = s[_SQQ] - s[_SQ] * s[_SQ] / number
+    line = (s[_SQI] - s[_SQ] * s[_SI] / number) / max(spread, number * 1e-4)
+    travel = q - s[_Q0] if s[_SEEN] > 0.0 else 0.0
+    free = s[_FREE] if s[_SEEN] > 0.0 else load
+    since = min(t - s[_T0], LONGEST) if s[_SEEN] > 0.0 else 0.0
+
+    out[0], out[1], out[2], out[3] = i, r, q, mi
+    out[4], out[5], out[6] = _logarithm(slope, _SLOPE), _logarithm(step, _SLOPE), high - low
+    out[7], out[8], out[9], out[10] = velocity, reference_velocity, r - q, reference_velocity - velocity
+    out[11], out[12] = _logarithm(ratio, _RATIO), _logarithm(step_q, _RATIO)
+    out[13], out[14] = free, abs(i) - s[_I0] if s[_SEEN] > 0.0 else 0.0
+    out[15], out[16], out[17], out[18] = s[_Q0], s[_V0], since, travel
+    out[19] = _logarithm((abs(i) - s[_I0]) / max(abs(travel), 0.01), _RATIO) if s[_SEEN] > 0.0 else 0.0
+    out[20] = _logarithm(line, _RATIO)
+    out[21], out[22] = _logarithm(s[_STEEP], _SLOPE), _logarithm(s[_STEEP_Q], _RATIO)
+    out[23], out[24] = s[_RISE], s[_TRAVEL]
+    out[25] = (abs(i) - s[_I0]) / max(s[_RISE], 0.02)
+    out[26], out[27], out[28] = load, load - free, s[_LOAD_RISE]
+    out[29] = _logarithm(s[_LOAD_RISE] / max(s[_TRAVEL], 0.02), _RATIO)
+    out[30] = acceleration
+    out[31] = min(t - s[_ONSET], 2.0 * LONGEST)
+    return blind
+
+
+@njit(cache=True)
+def window_series(t: Any, i: Any, r: Any, q: Any, ticks: Any, mask: float, width: int) -> Any:
+    """Features (n, width) and blind (n,) of whole arrays (n,); a sample that is no tick leaves no trace."""
+    state = np.zeros(STATE)
+    _begin(state, -np.inf, -np.inf)
+    values, blind = np.empty((len(t), width)), np.empty(len(t), dtype=np.bool_)
+    for k in range(len(t)):
+        used = state if ticks[k] else state.copy()
+        blind[k] = window_features(used, t[k], i[k], r[k], q[k], mask, values[k])
+    return values, blind
