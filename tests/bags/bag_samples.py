@@ -29,7 +29,7 @@ def canonical(time: np.ndarray) -> np.ndarray:
 def values_of(name: str, n: int, rng: np.random.Generator) -> Any:
     if name.startswith("joint_"):
         return rng.normal(size=(n, 13))
-    if name == "stiffness_probability":
+    if name in ("stiffness_probability", "stiffness_estimate"):
         return rng.random((n, 3))
     if name == "stiffness_label":
         return np.array(["void", "soft", "rigid"])[rng.integers(0, 3, n)]

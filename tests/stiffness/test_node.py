@@ -15,7 +15,7 @@ from hannes_ros.convert import JointSample
 from hannes_sim.factory import make_plant
 from hannes_sim.objects import RIGID_DYNAMOMETER
 from hannes_sim.rollout import rollout
-from hannes_stiffness.classifier import StiffnessClassifier
+from hannes_stiffness.classifier import NOT_SURE, StiffnessClassifier, class_label
 from hannes_stiffness.features import extract
 
 pytestmark = pytest.mark.ros
@@ -46,7 +46,7 @@ class Bench:
             n: topics.publisher(self.node, n)
             for n in ("motor_current", "reference_position", "encoder_position")
         }
-        self.classes, self.labels, self.probabilities, self.health = [], [], [], {}
+        self.classes, self.labels, self.probabilities, self.estimates, self.health = [], [], [], [], {}
         node = self.node
         node.create_subscription(
             topics.message_type("stiffness_class"),
@@ -65,6 +65,12 @@ class Bench:
             "stiffness/probability",
             lambda m: self.probabilities.append(list(m.data)),
             topics.qos("stiffness_probability"),
+        )
+        node.create_subscription(
+            topics.message_type("stiffness_estimate"),
+            "stiffness/estimate",
+            lambda m: self.estimates.append(list(m.data)),
+            topics.qos("stiffness_estimate"),
         )
         from diagnostic_msgs.msg import DiagnosticArray
 
@@ -121,18 +127,19 @@ def bench(ros_context):
         each.close()
 
 
-def expected(arrays):
-    classifier = StiffnessClassifier.load()
+def expected(arrays, name="", least=None):
+    """Answered classes, not sure among them, and all the answers."""
+    classifier = StiffnessClassifier.load(name)
     features = extract(*arrays, classifier.spec)
-    return classifier.classify(features.values, features.void), classifier.probabilities(
-        features.values, features.void
-    )
+    answers = classifier.answer(features.values, features.void)
+    return answers.sure(classifier.least if least is None else least), answers
 
 
 def test_in_lockstep_it_answers_as_the_array_code(bench, closure):
     it = bench("clock:=lockstep")
-    classes, probabilities = expected(closure)
+    classes, answers = expected(closure)
     assert (classes > 0).sum() > 20
+    stiffness = answers.stiffness[classes != 0]
     for row in zip(*closure, strict=True):
         it.publish(*map(float, row))
     it.wait(
@@ -140,14 +147,28 @@ def test_in_lockstep_it_answers_as_the_array_code(bench, closure):
             len(it.classes) >= len(classes)
             and len(it.labels) >= len(classes)
             and len(it.probabilities) >= len(classes)
+            and len(it.estimates) >= len(stiffness)
         )
     )
     np.testing.assert_array_equal(it.classes, classes)
-    np.testing.assert_allclose(it.probabilities, probabilities, atol=1e-7)
-    assert it.labels == [("void", "rigid", "soft")[k] for k in classes]
+    np.testing.assert_allclose(it.probabilities, answers.probabilities, atol=1e-7)
+    np.testing.assert_allclose(it.estimates, stiffness, rtol=1e-6)
+    assert it.labels == [class_label(k) for k in classes]
     code, output = it.end(signal.SIGINT)
     assert code == 0, output
     assert "Traceback" not in output
+
+
+def test_below_the_least_probability_it_is_not_sure_and_the_thesis_method_gives_no_stiffness(bench, closure):
+    it = bench("clock:=lockstep", "classifier:=baseline", "sure:=0.999")
+    classes, _ = expected(closure, "baseline", 0.999)
+    assert (classes == NOT_SURE).any()
+    for row in zip(*closure, strict=True):
+        it.publish(*map(float, row))
+    it.wait(lambda: len(it.classes) >= len(classes) and len(it.labels) >= len(classes))
+    np.testing.assert_array_equal(it.classes, classes)
+    assert "not sure" in it.labels
+    assert it.estimates == []
 
 
 def test_in_real_time_it_survives_bad_values_gaps_and_a_restart(bench, closure):

@@ -100,9 +100,16 @@ _ALL = (
         "data",
         "total fingertip force on the object (the dynamometer)",
     ),
-    Signal("stiffness_label", "stiffness/label", "std_msgs/msg/String", "", "data", "void, rigid or soft"),
     Signal(
-        "stiffness_class", "stiffness/class", "std_msgs/msg/Float64", "", "data", "0 void, 1 rigid, 2 soft"
+        "stiffness_label", "stiffness/label", "std_msgs/msg/String", "", "data", "void, rigid, soft or not sure"
+    ),
+    Signal(
+        "stiffness_class",
+        "stiffness/class",
+        "std_msgs/msg/Float64",
+        "",
+        "data",
+        "0 void, 1 rigid, 2 soft, -1 not sure",
     ),
     Signal(
         "stiffness_probability",
@@ -111,6 +118,14 @@ _ALL = (
         "",
         "data",
         "probabilities of void, rigid, soft",
+    ),
+    Signal(
+        "stiffness_estimate",
+        "stiffness/estimate",
+        "std_msgs/msg/Float64MultiArray",
+        "N/m",
+        "data",
+        "stiffness of the grasp, lower and upper end of its 90 % interval; only while something is grasped",
     ),
 )
 

@@ -3,8 +3,8 @@
 Bagging: every tree sees a bootstrap sample of the data and all features; the probabilities of the trees' leaves are
 averaged (Breiman, Bagging predictors, Machine Learning 24, 1996). Boosting: Friedman, Stochastic gradient boosting,
 CSDA 38, 2002. Calibration: a multinomial regression on the logarithms of held-out probabilities (Platt 1999, in its
-form for several classes: Kull et al., NeurIPS 2019). Interval of the stiffness: split conformal prediction on held-out residuals
-over their expected size (Lei et al., JASA 113, 2018).
+form for several classes: Kull et al., NeurIPS 2019). Interval of the stiffness: split conformal prediction on held-
+out residuals over their expected size (Lei et al., JASA 113, 2018).
 
 scikit-learn is imported at its first use.
 """

@@ -1,4 +1,4 @@
-"""The node `stiffness_classifier`: motor current, reference and encoder in; label, class and probability out.
+"""The node `stiffness_classifier`: motor current, reference and encoder in; label, class, probability, stiffness out.
 
 Time is the stamp of motor/state, so simulated, recorded and real time all work, at any rate of the inputs. In real time
 each state meets the newest current and reference; in lock-step the messages of one tick meet.
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from time import monotonic
 
 from hannes_description.errors import HannesError
-from hannes_description.signals import STIFFNESS_CLASSES
 from hannes_ros.convert import MOTOR_STATE, JointSample, float64_bytes, float64_value
 from hannes_ros.diagnostics import OK, WARN, Diagnostics, Health
 from hannes_ros.lockstep import TickJoin
@@ -24,8 +23,8 @@ from hannes_ros.topics import publisher, subscription
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray, String
 
-from .classifier import StiffnessClassifier
-from .features import FeatureStream, believable
+from .classifier import NOT_SURE, StiffnessClassifier, class_label
+from .features import FeatureStream, Sample, believable
 
 _STATE, _CURRENT, _REFERENCE = range(3)
 _LONGEST_QUEUE = 4000
@@ -40,7 +39,13 @@ class StiffnessParameters:
     """Parameters of the node."""
 
     classifier: str = parameter(
-        "", "Trained classifier (.onnx, its .json beside it); empty: the one installed"
+        "", "Trained classifier (.onnx, its .json beside it), or baseline; empty: the one installed"
+    )
+    sure: float = parameter(
+        -1.0,
+        'Least probability of an answer; below it "not sure"; negative: as the classifier was trained',
+        lower=-1.0,
+        upper=1.0,
     )
     rate: float = parameter(30.0, "Answers per second of message time", lower=0.1, upper=1000.0, unit="Hz")
     timeout: float = parameter(
@@ -59,8 +64,9 @@ class StiffnessNode(HannesNode, Node):
         super().__init__(self.node_name, namespace=DEFAULT_NAMESPACE, cli_args=cli_args)
         self._settings = declare(self, StiffnessParameters)
         self._classifier = StiffnessClassifier.load(self._settings.classifier)
+        self._sure = self._settings.sure if self._settings.sure >= 0.0 else self._classifier.least
         self._stream = FeatureStream(self._classifier.spec, self._settings.rate)
-        self._health = Health("not_finite", "unknown_joint", "stale_input", "lost_ticks")
+        self._health = Health("not_finite", "unknown_joint", "stale_input", "lost_ticks", "not_sure")
         self._latest: dict[int, tuple[float, float]] = {}
         self._currents: list[float] = []
         self._join = TickJoin(3)
@@ -75,6 +81,10 @@ class StiffnessNode(HannesNode, Node):
         self._probability = publisher(self, "stiffness_probability")
         self._class = publisher(self, "stiffness_class")
         self._text = publisher(self, "stiffness_label")
+        self._estimate = publisher(self, "stiffness_estimate")
+        # The first answer compiles nothing and loads nothing any more.
+        self._answer(Sample(0.0, (0.0,) * len(self._classifier.spec.names), False))
+        FeatureStream(self._classifier.spec).push(0.0, 0.0, 0.0, 0.0)
         subscription(self, "motor_current", lambda data: self._number(_CURRENT, data))
         subscription(self, "reference_position", lambda data: self._number(_REFERENCE, data))
         subscription(self, "encoder_position", self._state)
@@ -153,13 +163,25 @@ class StiffnessNode(HannesNode, Node):
         sample = self._stream.push(state.stamp_ns * 1e-9, current, reference, encoder)
         if sample is None:
             return
-        probability = self._classifier.probabilities([sample.values], [sample.void])[0]
-        best = int(probability.argmax())
-        self._label = STIFFNESS_CLASSES[best]
-        self._probability.publish(Float64MultiArray(data=probability.tolist()))
+        best, probability, stiffness = self._answer(sample)
+        self._label = class_label(best)
+        if best == NOT_SURE:
+            self._health.count("not_sure")
+        self._probability.publish(Float64MultiArray(data=probability))
         self._class.publish(float64_bytes(float(best)))
         self._text.publish(String(data=self._label))
+        if best != 0 and math.isfinite(stiffness[0]):
+            self._estimate.publish(Float64MultiArray(data=stiffness))
         self._health.cycles += 1
+
+    def _answer(self, sample: Sample) -> tuple[int, list[float], list[float]]:
+        """Class, probabilities and stiffness of one sample."""
+        answers = self._classifier.answer([sample.values], [sample.void])
+        return (
+            int(answers.sure(self._sure)[0]),
+            answers.probabilities[0].tolist(),
+            answers.stiffness[0].tolist(),
+        )
 
     def _report(self) -> tuple[bytes, str, Mapping[str, object]]:
         values = {
