@@ -47,6 +47,17 @@ def test_battery_saver_drops_and_releases(law: DoublePID) -> None:
         law.update(10.0, 3.0, 0.0)
     assert law.saving and law.current_reference == pytest.approx(0.0)
     law.update(10.0 - 1.5 * settings.saver_release, 3.0, 0.0)
+    assert law.saving, "a reference that still asks to close must not close the hand again"
+    law.update(2.5, 3.0, 0.0)
+    assert not law.saving and law.current_reference < 0.0
+
+
+def test_battery_saver_ends_when_more_is_asked_for(law: DoublePID) -> None:
+    settings = law.settings
+    for _ in range(round((settings.saver_time + 0.1) / law.period)):
+        law.update(10.0, 3.0, settings.saver_current + 0.2)
+    assert law.saving
+    law.update(10.0 + 1.5 * settings.saver_release, 3.0, 0.0)
     assert not law.saving and law.current_reference > 0.0
 
 

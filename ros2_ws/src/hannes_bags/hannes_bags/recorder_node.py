@@ -46,8 +46,10 @@ class RecorderParameters:
     topics: tuple[str, ...] = parameter(
         (), "topics to record; empty for those of the hand, /clock and /diagnostics"
     )
+    condition: str = parameter("", "what was done, for instance slow, fast or grasp; kept in the bag")
+    object: str = parameter("", "what the hand closed on: none, soft or rigid; kept in the bag")
     metadata: str = parameter(
-        "", "what the bag shall say of itself, as a JSON object (condition, object, seed ...)"
+        "", "what else the bag shall say of itself, as a JSON object (condition, object, seed ...)"
     )
     clock: str = parameter(
         "auto",
@@ -79,7 +81,8 @@ class RecorderParameters:
             raise HannesError(f"Parameter 'metadata' is not JSON: {error}.") from None
         if not isinstance(value, dict):
             raise HannesError('Parameter \'metadata\' must be a JSON object, such as {"condition": "slow"}.')
-        return value
+        said = {"condition": self.condition, "object": self.object}
+        return {name: text for name, text in said.items() if text} | value
 
 
 def message_class(msgtype: str) -> type:

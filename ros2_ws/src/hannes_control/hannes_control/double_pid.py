@@ -3,7 +3,7 @@
 Thesis P12: outer P on the position error gives the current reference, limited to +-4.6 A (P11); inner PI on the
 current error gives the voltage, limited to +-12 V.  The outer loop needs damping: P alone rings with the rotor's
 inertia.  Battery saver: when the current stays above a threshold for a time, the outer gain drops to zero and dry
-friction holds the grip until the reference opens again.
+friction holds the grip until the reference asks for less than the hand's position, or for more than before.
 
 The law is one pure function, called by the node and, compiled, by the simulator's rollout.
 """
@@ -52,7 +52,8 @@ class DoublePIDParameters:
     voltage_limit  V, limit of the command (the supply)
     saver_current  A, battery saver: threshold of |current|
     saver_time     s, battery saver: time above the threshold before the outer gain drops to zero
-    saver_release  rad, battery saver: the reference must fall by this much to end it
+    saver_release  rad, battery saver: a reference that rises by this much closes further; one below the hand's position
+                   opens it
     """
 
     kp: float
@@ -127,8 +128,8 @@ def control(x: Any, p: Any, s: Any) -> float:
         s[_SAVING] = 1.0
         s[_SAVED_REFERENCE] = x[C_REFERENCE]
     if s[_SAVING] == 1.0:
-        s[_SAVED_REFERENCE] = max(s[_SAVED_REFERENCE], x[C_REFERENCE])
-        if x[C_REFERENCE] < s[_SAVED_REFERENCE] - p[_SAVER_RELEASE]:
+        # An open command is a reference on the open side of the hand: until it is there, it would close the hand again.
+        if x[C_REFERENCE] < position or x[C_REFERENCE] > s[_SAVED_REFERENCE] + p[_SAVER_RELEASE]:
             s[_SAVING] = 0.0
             s[_SAVER_CLOCK] = 0.0
         else:

@@ -89,6 +89,8 @@ class MotorController(HannesNode, LifecycleNode):
         self._voltage = topics.publisher(self, "motor_voltage")
         topics.subscription(self, "encoder_position", self._on_tick_state if self._lockstep else self._on_state)
         topics.subscription(self, "motor_current", self._on_tick_current if self._lockstep else self._on_current)
+        # who records wants the reference on its topic, wherever it comes from
+        self._own_reference = None if self._profile is None else topics.publisher(self, "reference_position")
         if self._profile is None:
             topics.subscription(self, "reference_position",
                                 self._on_tick_reference if self._lockstep else self._on_reference)
@@ -167,8 +169,10 @@ class MotorController(HannesNode, LifecycleNode):
             return None
 
     def _profile_at(self, tick: int) -> float:
-        assert self._profile is not None
-        return float(self._profile[min(max(tick, 0), self._profile.size - 1)])
+        assert self._profile is not None and self._own_reference is not None
+        reference = float(self._profile[min(max(tick, 0), self._profile.size - 1)])
+        self._own_reference.publish(convert.float64_bytes(reference))
+        return reference
 
     # -- real time ---------------------------------------------------------------------------------------------------
     def _on_state(self, data: bytes) -> None:

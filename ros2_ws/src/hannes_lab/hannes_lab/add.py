@@ -8,6 +8,8 @@ from typing import Any
 
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_sim.effect import load_effect
+from hannes_sim.plant import PlantDiverged
 
 from .chance import chance
 from .diagnose import Fall, FoundEffect, error_falls, fitted_model, found_effects
@@ -53,6 +55,7 @@ def add_effects(prepared: Prepared, sources: Mapping[str, str], *, progress: Pro
         raise HannesError(
             "No effect to add: give --effect NAME (see `hannes model effects`) or path.py:Class."
         )
+    check_effects(prepared, sources)
     search = Search(prepared.problem, prepared.model, prepared.nuisances, sources, progress=progress)
     best = search.null()
     for k, name in enumerate(sources):
@@ -89,3 +92,18 @@ def with_provenance(model: Model, prepared: Prepared, falls: Sequence[Fall], com
             **({"command": command} if command else {}),
         },
     )
+
+
+def check_effects(prepared: Prepared, sources: Mapping[str, str]) -> None:
+    """Refuse an effect with which the plant diverges at its typical values; HannesError names it."""
+    for name, source in sources.items():
+        kind = prepared.rig.effect(load_effect(source))
+        model = prepared.model.with_effect(kind.entry(source=source if ":" in source else None))
+        for trial in prepared.rig.trials:
+            try:
+                prepared.rig.simulate(model, {}, trial, trial.reference[: round(5.0 / trial.period)])
+            except PlantDiverged as error:
+                raise HannesError(
+                    f"Effect '{name}' makes the plant diverge at its typical values, in '{trial.name}': {error} "
+                    "Check its equation, its sign and its typical values."
+                ) from error

@@ -42,9 +42,13 @@ Objects = Annotated[
 ]
 RigFile = Annotated[
     str | None,
-    typer.Option("--rig", help="Another machine's adapter, as path.py:Class; BAGS are then the files that it reads."),
+    typer.Option(
+        "--rig", help="Another machine's adapter, as path.py:Class; BAGS are then the files that it reads."
+    ),
 ]
-MaxEffects = Annotated[int, typer.Option("--max-effects", min=1, help="Most effects that a diagnosis may name.")]
+MaxEffects = Annotated[
+    int, typer.Option("--max-effects", min=1, help="Most effects that a diagnosis may name.")
+]
 Greedy = Annotated[
     bool,
     typer.Option(
@@ -195,8 +199,12 @@ def _show_comparison(result: Comparison) -> None:
             "fails" if c.fails else "",
         )
     console.print(table)
-    table = Table(title="Figures of the thesis") if result.metrics else Table(show_header=False, show_edge=False)
-    for name in ("condition", "figure", "measured", "sd", "model", "relative error") if result.metrics else ():
+    table = (
+        Table(title="Figures of the thesis") if result.metrics else Table(show_header=False, show_edge=False)
+    )
+    for name in (
+        ("condition", "figure", "measured", "sd", "model", "relative error") if result.metrics else ()
+    ):
         table.add_column(name, justify="left" if name in ("condition", "figure") else "right")
     for m in result.metrics:
         table.add_row(
@@ -387,8 +395,12 @@ def hide(
         name, _, factor = text.partition("=")
         try:
             entries.append(strength_of(name, float(factor) if factor else 1.0))
+        except HannesError:
+            raise
         except ValueError as error:
-            raise HannesError(f"--effect {text}: {error}") from error
+            raise HannesError(
+                f"--effect {text}: give NAME or NAME=FACTOR with a number as the factor."
+            ) from error
     recordings, hidden = make_set(
         Model.load(model),
         entries,

@@ -166,7 +166,8 @@ def _contact(prepared: Prepared, values: Mapping[str, float]) -> dict[int, tuple
         if "grip_force" in trial.signals:
             time, force = trial.signals["grip_force"]
         else:
-            run = prepared.rig.simulate(prepared.model, values, trial, trial.reference)
+            end = round(trial.closures[min(1, len(trial.closures) - 1)].stop / trial.period) + 1
+            run = prepared.rig.simulate(prepared.model, values, trial, trial.reference[:end])
             if "grip_force" not in run:
                 out[k] = None
                 continue
@@ -190,7 +191,11 @@ def _labels(
 
 
 def _cells(
-    features: Features, predicted: list[Array], labels: list[NDArray[np.int64]], seed: int, names: Sequence[str]
+    features: Features,
+    predicted: list[Array],
+    labels: list[NDArray[np.int64]],
+    seed: int,
+    names: Sequence[str],
 ) -> tuple[Cell, ...]:
     rng = np.random.default_rng(seed)
     rows: list[dict[str, Any]] = []

@@ -92,9 +92,11 @@ class FoundEffect:
 
 @dataclass(frozen=True)
 class Fall:
-    """One step of the error's fall, in multiples of the repeatability: fitted on every second closure, judged on the
-    others; by_condition: error on each condition when it took no part in the fit; held_out_signals: the same per signal, root
-    mean square over the conditions in the signal's unit."""
+    """One step of the error's fall, in multiples of the repeatability: fitted on every second closure, judged on the others.
+
+    by_condition      error on each condition when it took no part in the fit
+    held_out_signals  the same per signal, root mean square over the conditions in the signal's unit
+    """
 
     added: str
     train: float
@@ -222,6 +224,9 @@ def diagnose(
     tied = _ties(choice) if verdict == "effects" else ()
     model = fitted_model(prepared.model, search, best) if best.names else prepared.model
     falls = error_falls(prepared, search, best, progress, in_order=greedy)
+    if verdict == "unknown":
+        best, falls = _worth_showing(search, best, falls)
+        model = fitted_model(prepared.model, search, best) if best.names else prepared.model
     effects = found_effects(search, best, limits, falls)
     experiments = (
         separating_experiments(prepared, search, [search.found[tuple(sorted(n))] for n in tied])
@@ -311,6 +316,17 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         choice = _Choice(new, best, limits_new, best.fit.cost <= ADEQUATE * limits_new.misfit, ranking, close)
         front = [best, *front[1:]]
     return choice
+
+
+def _worth_showing(
+    search: Search, best: Candidate, falls: tuple[Fall, ...]
+) -> tuple[Candidate, tuple[Fall, ...]]:
+    """Where something unknown is left, only those effects that lower the error on held-out closures are shown."""
+    keep = 1 + int(np.argmin([fall.held_out for fall in falls[1:]]))
+    names = tuple(fall.added for fall in falls[2 : keep + 1])
+    if len(names) == len(best.names):
+        return best, falls
+    return search.found[tuple(sorted(names))], falls[: keep + 1]
 
 
 def _share(null: Candidate, candidate: Candidate, limits: Chance) -> float:

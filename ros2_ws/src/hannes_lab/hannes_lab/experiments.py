@@ -103,7 +103,7 @@ def _noise(prepared: Prepared) -> dict[str, float]:
 
 
 def _trial(like: Trial, name: str, profile: str, options: dict[str, float], grasp: str) -> Trial:
-    reference = make_profile(profile, closures=1, dt=like.period, **options)
+    reference = make_profile(profile, closures=2, dt=like.period, **options)
     meta = {**like.options, "object": grasp}
     return Trial(name, like.period, reference, like.signals, like.closures, meta)
 
@@ -125,7 +125,10 @@ def _predict(
         trial.reference,
     )
     every = max(1, round(1.0 / 30.0 / trial.period))
-    return np.concatenate([run[signal][::every] / sd for signal, sd in noise.items()])
+    second = (
+        trial.reference.size // 2
+    )  # the first closure starts from rest at encoder zero and tells of that alone
+    return np.concatenate([run[signal][second::every] / sd for signal, sd in noise.items()])
 
 
 def _sensitivity(

@@ -156,6 +156,8 @@ def check_effect(effect: EffectType, where: str) -> EffectType:
         "contribute" not in b.__dict__ for b in effect.__mro__[:-2]
     ):
         raise HannesError(f"{where}: effect '{effect.name}' defines no `contribute(x, p, s, y)`.")
+    if not effect.title:
+        effect.title = effect.name.replace("_", " ")
     return effect
 
 
