@@ -36,7 +36,12 @@ MODULES = {
 }
 LOOP = ("motor_controller", "hand_sim")
 CHAIN = ("emg_source", "emg_reference", "motor_controller", "hand_sim")
-TARGETS = {("processes", LOOP): 3.0, ("processes", CHAIN): 3.0, ("composed", LOOP): 8.0, ("composed", CHAIN): 8.0}
+TARGETS = {
+    ("processes", LOOP): 3.0,
+    ("processes", CHAIN): 3.0,
+    ("composed", LOOP): 8.0,
+    ("composed", CHAIN): 8.0,
+}
 
 
 @dataclass(frozen=True)
@@ -80,20 +85,46 @@ def in_process(plant: str, seconds: float) -> float:
 
 def graph(kind: str, names: tuple[str, ...], plant: str, seconds: float) -> Result:
     """Run hand_sim and its peers for `seconds` of simulated time."""
-    own = {"hand_sim": {"duration": seconds, "plant": plant, "subscribers": len(names) - 1},
-           "motor_controller": ({} if "emg_reference" in names
-                                else {"reference": "half_sine", "reference_closures": 100}),
-           "emg_source": {"closures": 100}, "emg_reference": {}}
+    own = {
+        "hand_sim": {"duration": seconds, "plant": plant, "subscribers": len(names) - 1},
+        "motor_controller": (
+            {} if "emg_reference" in names else {"reference": "half_sine", "reference_closures": 100}
+        ),
+        "emg_source": {"closures": 100},
+        "emg_reference": {},
+    }
     if kind == "composed":
         rules = [f"{name}:{key}:={value}" for name in names for key, value in own[name].items()]
-        commands = [[sys.executable, "-m", "hannes_bringup.composed_node", "--nodes", ",".join(names), "--ros-args",
-                     *(part for rule in ("clock:=lockstep", *rules) for part in ("-p", rule))]]
+        commands = [
+            [
+                sys.executable,
+                "-m",
+                "hannes_bringup.composed_node",
+                "--nodes",
+                ",".join(names),
+                "--ros-args",
+                *(part for rule in ("clock:=lockstep", *rules) for part in ("-p", rule)),
+            ]
+        ]
     else:
-        commands = [[sys.executable, "-m", MODULES[name], "--ros-args",
-                     *(part for rule in ("clock:=lockstep", *(f"{k}:={v}" for k, v in own[name].items()))
-                       for part in ("-p", rule))] for name in names]
-    children = [subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-                for command in commands]
+        commands = [
+            [
+                sys.executable,
+                "-m",
+                MODULES[name],
+                "--ros-args",
+                *(
+                    part
+                    for rule in ("clock:=lockstep", *(f"{k}:={v}" for k, v in own[name].items()))
+                    for part in ("-p", rule)
+                ),
+            ]
+            for name in names
+        ]
+    children = [
+        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        for command in commands
+    ]
     lines: list[str] = []
     started, ended = threading.Event(), threading.Event()
 
@@ -134,24 +165,35 @@ def graph(kind: str, names: tuple[str, ...], plant: str, seconds: float) -> Resu
     tick_us = elapsed / (seconds / PERIOD) * 1e6
     window = max(at - start, 1e-9)
     cores, all_cores = (last - before) / window, (last_busy - busy_before) / window
-    return Result(kind, " + ".join(names), seconds / elapsed, tick_us, cores * tick_us, max(0.0, all_cores - cores),
-                  TARGETS[kind, names])
+    return Result(
+        kind,
+        " + ".join(names),
+        seconds / elapsed,
+        tick_us,
+        cores * tick_us,
+        max(0.0, all_cores - cores),
+        TARGETS[kind, names],
+    )
 
 
 def limit(result: Result, plant_us: float) -> str:
     """What most of a tick goes into."""
     cores = os.cpu_count() or 1
     floor = result.cpu_us / cores if result.kind == "processes" else result.cpu_us
-    parts = {"the plant and the law": plant_us,
-             "computing in the nodes and the middleware": max(0.0, floor - plant_us),
-             "waiting for messages, threads and a free core": max(0.0, result.tick_us - max(floor, plant_us))}
+    parts = {
+        "the plant and the law": plant_us,
+        "computing in the nodes and the middleware": max(0.0, floor - plant_us),
+        "waiting for messages, threads and a free core": max(0.0, result.tick_us - max(floor, plant_us)),
+    }
     name = max(parts, key=lambda key: parts[key])
     return f"{name} ({parts[name]:.0f} of {result.tick_us:.0f} us)"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--seconds", type=float, default=10.0, help="simulated time of each run with processes")
+    parser.add_argument(
+        "--seconds", type=float, default=10.0, help="simulated time of each run with processes"
+    )
     parser.add_argument("--plant", default="reduced", help="reduced or mujoco")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     arguments = parser.parse_args()
@@ -161,18 +203,29 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as logs:
         os.environ["ROS_LOG_DIR"] = logs
         plant_us = in_process(arguments.plant, arguments.seconds)
-        results = [graph(kind, names, arguments.plant, arguments.seconds * (1.0 if kind == "processes" else 2.0))
-                   for names in (LOOP, CHAIN) for kind in ("processes", "composed")]
+        results = [
+            graph(kind, names, arguments.plant, arguments.seconds * (1.0 if kind == "processes" else 2.0))
+            for names in (LOOP, CHAIN)
+            for kind in ("processes", "composed")
+        ]
     if arguments.json:
-        print(json.dumps({"plant": arguments.plant, "rollout_us": plant_us, "graphs": [asdict(r) for r in results]}))
+        print(
+            json.dumps(
+                {"plant": arguments.plant, "rollout_us": plant_us, "graphs": [asdict(r) for r in results]}
+            )
+        )
         return
     print(f"lock-step at {1 / PERIOD:.0f} Hz control, plant {arguments.plant}, {os.cpu_count()} cores")
     print(f"  in process     {PERIOD * 1e6 / plant_us:8.1f} x real time  ({plant_us:.1f} us a tick)")
     for result in results:
         verdict = "reached" if result.ratio >= result.target else "NOT reached"
-        print(f"  {result.kind:<10} {result.ratio:12.1f} x real time  (target {result.target:.0f}, {verdict}; "
-              f"{result.tick_us:.0f} us a tick, CPU {result.cpu_us:.0f} us)  {result.nodes}")
-        print(f"             limited by {limit(result, plant_us)}; others used {result.other_load:.1f} cores meanwhile")
+        print(
+            f"  {result.kind:<10} {result.ratio:12.1f} x real time  (target {result.target:.0f}, {verdict}; "
+            f"{result.tick_us:.0f} us a tick, CPU {result.cpu_us:.0f} us)  {result.nodes}"
+        )
+        print(
+            f"             limited by {limit(result, plant_us)}; others used {result.other_load:.1f} cores meanwhile"
+        )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """How well the lab finds hidden effects: `python bench/identification.py [--sets ...] [--quick] [--jobs N]`.
 
-Makes measurement sets with `hide` (hand of the population, scatter, the thesis' sensors), diagnoses each blind, and prints
-a table of verdicts.  Every case is kept in a file named by its content and the sources' hash, so that an interrupted run
-goes on where it stopped.  The seeds differ from those on which thresholds were set.
+Makes measurement sets with `hide` (hand of the population, scatter, the thesis' sensors), diagnoses each blind, and
+prints a table of verdicts.  Every case is kept in a file named by its content and the sources' hash, so that an
+interrupted run goes on where it stopped.  The seeds differ from those on which thresholds were set.
 
     nothing   nothing hidden
     single    one effect of the catalogue at 1.5, 2, 3, 5 and 8 times its detection limit

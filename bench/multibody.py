@@ -1,6 +1,6 @@
 """Speed of the multi-body plant in the closed loop: real-time factor, cost beside mj_step, and what limits it.
 
-    python bench/multibody.py
+python bench/multibody.py
 """
 
 from __future__ import annotations
@@ -76,7 +76,10 @@ def main() -> None:
             chosen = replace(model, variant={"return_mechanism": mechanism, "transmission": transmission})
             row = []
             objects: tuple[tuple[str, GraspObject | None], ...] = (
-                ("void", None), ("soft", SOFT_BALL), ("rigid", RIGID_DYNAMOMETER))
+                ("void", None),
+                ("soft", SOFT_BALL),
+                ("rigid", RIGID_DYNAMOMETER),
+            )
             for name, grasp in objects:
                 plant = MujocoPlant(chosen, grasp)
                 seconds = closure_time(plant, controller, reference)
@@ -86,16 +89,22 @@ def main() -> None:
                     worst = min(worst, factor)
             print(f"{mechanism:14s} {transmission:6s} nv {describe(plant)['nv']}: " + "; ".join(row))
     extra = overhead(model, controller, reference)
-    print(f"full model, slowest object: {worst:.1f} x real time (at least {TARGET_FACTOR:.0f}: "
-          f"{'met' if worst >= TARGET_FACTOR else 'MISSED'})")
-    print(f"control law, motor, effects and sensors beside mj_step: {100 * extra:.1f} % (at most "
-          f"{100 * TARGET_OVERHEAD:.0f} %: {'met' if extra <= TARGET_OVERHEAD else 'MISSED'})")
+    print(
+        f"full model, slowest object: {worst:.1f} x real time (at least {TARGET_FACTOR:.0f}: "
+        f"{'met' if worst >= TARGET_FACTOR else 'MISSED'})"
+    )
+    print(
+        f"control law, motor, effects and sensors beside mj_step: {100 * extra:.1f} % (at most "
+        f"{100 * TARGET_OVERHEAD:.0f} %: {'met' if extra <= TARGET_OVERHEAD else 'MISSED'})"
+    )
     disable = mujoco.mjtDisableBit
     base = without(0)
     bare = without(int(disable.mjDSBL_CONSTRAINT))
-    print(f"what limits it: of {base:.1f} us of mj_step, {base - bare:.1f} us are the constraints (dry friction, "
-          f"stops, wires: the Newton solver), {bare:.1f} us kinematics, inertia and integration of "
-          f"{describe(plant)['nbody']} bodies")
+    print(
+        f"what limits it: of {base:.1f} us of mj_step, {base - bare:.1f} us are the constraints (dry friction, "
+        f"stops, wires: the Newton solver), {bare:.1f} us kinematics, inertia and integration of "
+        f"{describe(plant)['nbody']} bodies"
+    )
 
 
 if __name__ == "__main__":

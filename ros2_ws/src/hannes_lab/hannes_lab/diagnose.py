@@ -92,8 +92,9 @@ class FoundEffect:
 
 @dataclass(frozen=True)
 class Fall:
-    """One step of the error's fall, in multiples of the repeatability: fitted on every second closure, judged on the others.
+    """One step of the error's fall, in multiples of the repeatability.
 
+    train, held_out   fitted on every second closure, judged on the others
     by_condition      error on each condition when it took no part in the fit
     held_out_signals  the same per signal, root mean square over the conditions in the signal's unit
     """
