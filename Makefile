@@ -5,6 +5,9 @@ BIN := $(VENV)/bin
 TESTS ?= tests
 # -n 2: two tests at a time; each test of ROS nodes has a domain id of its own
 PYTEST_FLAGS ?= -n 2 --dist loadgroup
+# one thread of linear algebra per process: the tests and the lab run processes side by side
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
 export VENV
 
 .DEFAULT_GOAL := help
