@@ -82,7 +82,7 @@ def test_a_stopped_calibration_goes_on_from_its_folder(tmp_path: Path) -> None:
         calibrate_targets(
             problem("sum", "difference"), NOMINAL, coordinates, starts=1, cache=tmp_path, progress=stop
         )
-    kept = len(list(tmp_path.glob("*.npy")))
+    kept = len(list(tmp_path.glob("*.f8")))
     assert kept == 5
     again = calibrate_targets(problem("sum", "difference"), NOMINAL, coordinates, starts=1, cache=tmp_path)
     fresh = calibrate_targets(problem("sum", "difference"), NOMINAL, coordinates, starts=1)
@@ -97,7 +97,7 @@ def test_a_stopped_calibration_goes_on_from_its_folder(tmp_path: Path) -> None:
 def test_a_cut_file_in_the_cache_is_made_again(tmp_path: Path) -> None:
     kept = Remembered(problem("sum"), "key", tmp_path)
     first = kept.residual(NOMINAL, {"friction.coulomb": 0.02})
-    (file,) = tmp_path.glob("*.npy")
+    (file,) = tmp_path.glob("*.f8")
     file.write_bytes(file.read_bytes()[:20])
     assert np.array_equal(kept.residual(NOMINAL, {"friction.coulomb": 0.02}), first)
 

@@ -167,10 +167,10 @@ class Remembered:
             + model.sha256
             + json.dumps(sorted((k, float(v)) for k, v in values.items()))
         )
-        path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()}.npy"
+        path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()}.f8"
         if path.exists():
             try:
-                kept = np.load(path, allow_pickle=False)
+                kept = np.fromfile(path, dtype="<f8")
                 if kept.shape == (self.problem.features.size,):
                     self.hits += 1
                     return np.asarray(kept, dtype=np.float64)
@@ -179,7 +179,7 @@ class Remembered:
         out = np.asarray(self.problem.residual(model, values), dtype=np.float64)
         part = path.with_suffix(f".{os.getpid()}.part")
         with part.open("wb") as file:
-            np.save(file, out, allow_pickle=False)
+            out.astype("<f8").tofile(file)
         part.replace(path)
         return out
 
