@@ -36,7 +36,10 @@ from joblib import Parallel, delayed
 SETS = ("nothing", "single", "pairs", "outside")
 FACTORS = (1.5, 2.0, 3.0, 5.0, 8.0)
 JUDGING_SEED = 50_000
-"""First seed of the sets that are judged; thresholds were set on seeds below 1000."""
+"""First seed of the sets that are judged; thresholds are set on seeds below."""
+
+TUNING_SEED = 1_000
+"""First seed of the sets on which thresholds are set (up to 31,100)."""
 
 DETECTABLE = 60.0
 """Fall of the cost at which an effect counts as detectable: about three times what chance gains."""
@@ -167,27 +170,27 @@ def highest_factor(name: str) -> float:
     )
 
 
-def cases(kinds: list[str], limits: dict[str, float], quick: bool) -> list[Case]:
-    """All sets of the bench."""
+def cases(kinds: list[str], limits: dict[str, float], quick: bool, first: int = JUDGING_SEED) -> list[Case]:
+    """All sets of the bench; `first` is the first seed."""
     out: list[Case] = []
     names = sorted(catalogue())
-    seed = itertools.count(JUDGING_SEED)
+    seed = itertools.count(first)
     if "nothing" in kinds:
-        out += [Case("nothing", (), 0.0, JUDGING_SEED + 10_000 + k) for k in range(10 if quick else 100)]
+        out += [Case("nothing", (), 0.0, first + 10_000 + k) for k in range(10 if quick else 100)]
     if "single" in kinds:
         for name in names:
             for factor in FACTORS[2:3] if quick else FACTORS:
                 f = min(factor * limits[name], highest_factor(name))
                 out.append(Case("single", ((name, strength(name, f)),), factor, next(seed)))
     if "pairs" in kinds:
-        rng = np.random.default_rng(JUDGING_SEED)
+        rng = np.random.default_rng(first)
         for k in range(6 if quick else 40):
             a, b = rng.choice(len(names), 2, replace=False)
             chosen = [
                 (names[i], strength(names[i], min(3.0 * limits[names[i]], highest_factor(names[i]))))
                 for i in (int(a), int(b))
             ]
-            out.append(Case("pairs", tuple(chosen), 3.0, JUDGING_SEED + 20_000 + k))
+            out.append(Case("pairs", tuple(chosen), 3.0, first + 20_000 + k))
     if "outside" in kinds:
         import outside_effects
 
@@ -196,7 +199,7 @@ def cases(kinds: list[str], limits: dict[str, float], quick: bool) -> list[Case]
         ):
             source = f"{OUTSIDE}:{name}"
             out.append(
-                Case("outside", ((source, strength(source, factor)),), factor, JUDGING_SEED + 30_000 + k)
+                Case("outside", ((source, strength(source, factor)),), factor, first + 30_000 + k)
             )
     return out
 
@@ -304,6 +307,9 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="a fifth of the sets or less")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument(
+        "--tuning", action="store_true", help="the seeds on which thresholds are set, not those that judge"
+    )
+    parser.add_argument(
         "--out", type=Path, default=Path("out/identification"), help="folder of the kept results"
     )
     parser.add_argument("--list", action="store_true", help="print every result that is not as hidden")
@@ -319,7 +325,7 @@ def main() -> int:
     else:
         limits = detection_factors(sorted(catalogue()))
         limits_file.write_text(json.dumps(limits))
-    todo = cases(kinds, limits, options.quick)
+    todo = cases(kinds, limits, options.quick, TUNING_SEED if options.tuning else JUDGING_SEED)
     results: list[dict[str, Any]] = []
     missing = []
     for case in todo:

@@ -30,7 +30,7 @@ from .problem import Problem, build_problem
 from .rig import Rig
 from .screen import usable_effects
 from .search import Candidate, Progress, Search, silent
-from .surrogate import anchored_at
+from .settle import slopes_at
 
 Array = NDArray[np.float64]
 
@@ -298,12 +298,13 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         enough = choice.best.fit.cost <= choice.limits.misfit
         if enough and size > 1:
             break
-        round_ = choice.search.extend(front, list(search.sources), texts[size - 1])
+        needed = choice.limits.gain if enough else max(choice.limits.gain, WORTHWHILE * choice.best.fit.cost)
+        worth = choice.best.penalised - 0.5 * needed
+        round_ = choice.search.extend(front, list(search.sources), texts[size - 1], worth)
         if not round_:
             break
         ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in round_)
         gain = choice.best.penalised - round_[0].penalised
-        needed = choice.limits.gain if enough else max(choice.limits.gain, WORTHWHILE * choice.best.fit.cost)
         if gain < needed:
             choice = replace(choice, ranking=ranking)
             break
@@ -458,7 +459,7 @@ def error_falls(
     for k, (label, candidate) in enumerate(steps):
         progress(k, len(steps), f"held-out error: {label}")
         f = candidate.fit
-        rig = anchored_at(search.problem.rig, f.model, f.values)
+        rig = slopes_at(search.problem.rig, f)
         build = problem_builder(prepared, rig, best.fit.values)
         problem = replace(search.problem, rig=rig)
         train, test = held_out_closures(build, features, f.model, f.coordinates, f.z)

@@ -114,7 +114,7 @@ class Features:
 
     def closures(self, rig: Rig, model: Model, values: Mapping[str, float]) -> list[Array]:
         """Predicted closures (n, p) of every block."""
-        memory = any(load_effect(effect.source or effect.name).memory for effect in model.effects)
+        memory = has_memory(model)
         runs: list[tuple[Mapping[str, Array], bool]] = []
         for trial, end in zip(self.trials, self.ends, strict=True):
             compact = end is not None and not memory
@@ -130,6 +130,11 @@ class Features:
         return np.concatenate([b.combine(c) for b, c in zip(self.blocks, closures, strict=True)])
 
 
+def has_memory(model: Model) -> bool:
+    """True where an effect of the model makes later closures differ from the second."""
+    return any(load_effect(effect.source or effect.name).memory for effect in model.effects)
+
+
 def build_features(trials: Sequence[Trial], signals: Sequence[str], points: int = MAX_PHASES) -> Features:
     """The operator for these trials and signals, with at most `points` phases to a closure.
 
@@ -138,7 +143,7 @@ def build_features(trials: Sequence[Trial], signals: Sequence[str], points: int 
     blocks: list[Block] = []
     ends: list[int | None] = []
     for number, trial in enumerate(trials):
-        end = _compact_end(trial)
+        end = compact_end(trial)
         ends.append(end)
         for condition in trial.conditions:
             for signal in signals:
@@ -153,7 +158,7 @@ def build_features(trials: Sequence[Trial], signals: Sequence[str], points: int 
     return Features(tuple(trials), tuple(blocks), tuple(ends))
 
 
-def _compact_end(trial: Trial) -> int | None:
+def compact_end(trial: Trial) -> int | None:
     """Ticks up to the end of the second closure, if all closures of the trial have the same reference."""
     if len(trial.conditions) != 1 or len(trial.closures) < 3:
         return None
@@ -186,7 +191,7 @@ def _block(
     compact: list[tuple[Index, Index, Array]] = []
     measured = []
     base = trial.closures[1] if may_compact else None
-    limit = _compact_end(trial) if may_compact else None
+    limit = compact_end(trial) if may_compact else None
     for closure in closures:
         at = closure.start + phase
         right = np.searchsorted(time, at)

@@ -16,11 +16,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-SMALLEST_STRENGTH = 0.02
-"""In typical values: an effect weaker than this is stepped as if it were this strong, well above the roughness of a
-simulation with dry friction."""
-
-
 @dataclass(frozen=True)
 class Fit:
     """A fitted point.
@@ -72,12 +67,7 @@ def finite_differences(
     values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
     for k, j in enumerate(columns):
         c = coordinates[j]
-        low, high = c.bounds
-        step = c.step if c.prior or c.log else c.step * max(abs(z[j]), SMALLEST_STRENGTH)
-        if z[j] + step > high:
-            step = -step
-        if z[j] + step < low:
-            step = 0.5 * (high - z[j]) if high - z[j] > z[j] - low else 0.5 * (low - z[j])
+        step = c.inside_step(float(z[j]))
         moved = problem.residual(model, {**values, c.name: c.value(float(z[j] + step))})
         out[:, k] = (moved - residual) / step
     return out

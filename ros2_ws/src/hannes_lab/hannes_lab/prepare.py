@@ -17,7 +17,8 @@ from .fit import fit
 from .hand import HandRig
 from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig
-from .surrogate import anchored_at, rig_for
+from .settle import settle
+from .surrogate import rig_for
 from .trials import SIGNALS, Closure, Trial, make_trial, unique_names
 
 OUTLIER = 6.0
@@ -123,9 +124,8 @@ def prepare(
     problem = build_problem(view, features, model, nuisances, {})
     coordinates = [nuisance_coordinate(n) for n in nuisances]
     found = fit(problem, model, coordinates, {}, evaluations=15)
-    sims = problem.simulations
-    problem = build_problem(anchored_at(view, model, found.values), features, model, nuisances, found.values)
-    problem.simulations = sims
+    settled, found = settle(problem, found)
+    problem = build_problem(settled.rig, features, model, nuisances, found.values, problem.counts)
     notes = [f"{trial.name}: {note}" for trial in trials for note in trial.notes]
     if len(features.conditions) < 2:
         notes.append(

@@ -12,7 +12,7 @@ Whitened residual: L_c^{-1} (measured - predicted), C_c = L_c L_c^T.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from hannes_description.model import EffectEntry, Model
@@ -28,6 +28,10 @@ Array = NDArray[np.float64]
 
 FAILED = 1e3
 """Whitened residual of a simulation that diverged: a large finite penalty."""
+
+SMALLEST_STRENGTH = 0.02
+"""In typical values: an effect weaker than this is stepped as if it were this strong, well above the roughness of a
+simulation with dry friction."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,16 @@ class Coordinate:
             if self.log
             else (value - self.offset) / self.scale
         )
+
+    def inside_step(self, z: float) -> float:
+        """Step of a finite difference at z that stays inside the bounds."""
+        low, high = self.bounds
+        step = self.step if self.prior or self.log else self.step * max(abs(z), SMALLEST_STRENGTH)
+        if z + step > high:
+            step = -step
+        if z + step < low:
+            step = 0.5 * (high - z) if high - z > z - low else 0.5 * (low - z)
+        return step
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -110,6 +124,14 @@ def vanishing_entry(
 
 
 @dataclass
+class Counts:
+    """Simulations of the whole data set so far, and those that diverged."""
+
+    simulations: int = 0
+    failures: int = 0
+
+
+@dataclass
 class Problem:
     """Data, noise and rig of one data set; counts its simulations.
 
@@ -121,12 +143,23 @@ class Problem:
     features: Features
     whitener: tuple[tuple[NDArray[np.int64], Array], ...]
     deviations: tuple[Array, ...]
-    simulations: int = 0
-    failures: int = 0
+    counts: Counts = field(default_factory=Counts)
     _measured: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         self._measured = self.features.measured
+
+    @property
+    def simulations(self) -> int:
+        return self.counts.simulations
+
+    @property
+    def failures(self) -> int:
+        return self.counts.failures
+
+    def with_rig(self, rig: Rig) -> Problem:
+        """The same data and noise seen with another rig; the counts go on together."""
+        return self if rig is self.rig else replace(self, rig=rig)
 
     def whiten(self, difference: Array) -> Array:
         """L^{-1} difference, for a vector (size,) or columns (size, k)."""
@@ -137,17 +170,22 @@ class Problem:
 
     def residual(self, model: Model, values: Mapping[str, float]) -> Array:
         """Whitened (measured - predicted), (size,); FAILED where the simulation diverges."""
-        self.simulations += 1
+        self.counts.simulations += 1
         try:
             predicted = self.features.predict(self.rig, model, values)
         except PlantDiverged:
-            self.failures += 1
+            self.counts.failures += 1
             return np.full(self._measured.size, FAILED)
         return self.whiten(self._measured - predicted)
 
 
 def build_problem(
-    rig: Rig, features: Features, model: Model, nuisances: Sequence[Nuisance], values: Mapping[str, float]
+    rig: Rig,
+    features: Features,
+    model: Model,
+    nuisances: Sequence[Nuisance],
+    values: Mapping[str, float],
+    counts: Counts | None = None,
 ) -> Problem:
     """Estimate noise and scatter from the repeats, with sensitivities taken at `values` of `model`.
 
@@ -199,7 +237,7 @@ def build_problem(
             )
             if rows.size:
                 whitener.append((rows, np.linalg.cholesky(single / count)))
-    return Problem(rig, features, tuple(whitener), tuple(deviations))
+    return Problem(rig, features, tuple(whitener), tuple(deviations), counts or Counts())
 
 
 def _pooled(features: Features, variances: Sequence[Array]) -> list[Array]:

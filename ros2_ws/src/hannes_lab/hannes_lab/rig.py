@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -32,6 +33,10 @@ Array = NDArray[np.float64]
 REFERENCE_SIZES = {"N.m": 0.05, "rad": 14.57, "V": 12.0, "A": 1.0, "s": 1.0}
 """What the catalogue's typical values and bounds are made for: a drive that needs 0.05 N.m to move freely over
 14.57 rad at up to 12 V and about 1 A.  Another machine's follow from these by dimension."""
+
+
+REMEMBERED = 48
+"""Simulations whose signals are kept: those of a whole Jacobian of three trials."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +145,7 @@ class PlantRig:
     def __init__(self, trials: Sequence[Trial]) -> None:
         self.trials = tuple(trials)
         self._plants: dict[tuple[str, ...], tuple[Plant, Controller, dict[str, float]]] = {}
+        self._signals: OrderedDict[tuple[Any, ...], dict[str, Array]] = OrderedDict()
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A class from a user's file cannot be imported by name in another process.
@@ -193,17 +199,24 @@ class PlantRig:
     def simulate(
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
     ) -> dict[str, Array]:
-        """See Rig."""
-        return self.logged(self.run(model, values, trial, reference), trial)
+        """See Rig.
+
+        The last simulations are remembered: a parameter of one trial (`name@trial`) does not move the others.
+        """
+        wanted = _wanted(model, values, trial)
+        key = (*self._key(model, trial), tuple(sorted(wanted.items())), reference.tobytes())
+        if key in self._signals:
+            self._signals.move_to_end(key)
+        else:
+            self._signals[key] = self.logged(self.run(model, values, trial, reference), trial)
+            if len(self._signals) > REMEMBERED:
+                self._signals.popitem(last=False)
+        return self._signals[key]
 
     def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
         """The rollout itself, with all that the plant can show."""
         plant, controller, base = self._plant(model, trial)
-        wanted = {f"{e.name}.{n}": p.value for e in model.effects for n, p in e.parameters.items()}
-        for name, value in values.items():
-            parameter, _, where = name.partition("@")
-            if not where or where == trial.name:
-                wanted[parameter] = value
+        wanted = _wanted(model, values, trial)
         for name in set(base) - set(wanted):
             plant.set(name, base[name])
         for name, value in wanted.items():
@@ -212,19 +225,27 @@ class PlantRig:
             plant.set(name, value)
         return rollout(plant, controller, reference, joints=False)
 
-    def _plant(self, model: Model, trial: Trial) -> tuple[Plant, Controller, dict[str, float]]:
+    def _key(self, model: Model, trial: Trial) -> tuple[str, ...]:
+        """What tells one plant from another, but for the values of its parameters."""
         structure = tuple(effect.source or effect.name for effect in model.effects)
-        key = (
-            model.plant,
-            model.controller,
-            model.parameters.sha256,
-            repr(sorted(model.variant.items())),
-            trial.name,
-            *structure,
-        )
+        variant = repr(sorted(model.variant.items()))
+        return (model.plant, model.controller, model.parameters.sha256, variant, trial.name, *structure)
+
+    def _plant(self, model: Model, trial: Trial) -> tuple[Plant, Controller, dict[str, float]]:
+        key = self._key(model, trial)
         if key not in self._plants:
             self._plants[key] = (self.plant(model, trial), self.controller(model, trial.period), {})
         return self._plants[key]
+
+
+def _wanted(model: Model, values: Mapping[str, float], trial: Trial) -> dict[str, float]:
+    """Parameters of the plant by name, for one trial."""
+    wanted = {f"{e.name}.{n}": p.value for e in model.effects for n, p in e.parameters.items()}
+    for name, value in values.items():
+        parameter, _, where = name.partition("@")
+        if not where or where == trial.name:
+            wanted[parameter] = value
+    return wanted
 
 
 def make_controller(model: Model, period: float) -> Controller:

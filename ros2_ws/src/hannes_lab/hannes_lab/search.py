@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,8 +23,9 @@ from .problem import (
     vanishing_entry,
 )
 from .rig import Nuisance
+from .settle import settle
 from .spectrum import position_periods
-from .surrogate import AnchoredRig, anchored_at
+from .surrogate import anchored_at
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -56,13 +57,6 @@ REFIT = 8
 POLISH = 3
 """Extensions of a round that are refitted with all derivatives afresh."""
 
-MOVES = 2
-"""How often the anchor of a slow plant moves before the slow plant itself is fitted."""
-
-EXACT = 3
-SETTLED = 2.0
-"""Fits on the slow plant with derivatives of its own: at most so many, while the cost falls by more than this."""
-
 PENALTY = 4.0
 """Cost of one parameter (Akaike's 2 doubled, since shape parameters are searched over several starts)."""
 
@@ -91,6 +85,10 @@ class Search:
 
     def __post_init__(self) -> None:
         self.coordinates = tuple(nuisance_coordinate(n) for n in self.nuisances)
+
+    def seen(self, base: Fit) -> Problem:
+        """The problem as seen from a fit: a slow plant's anchor is there."""
+        return self.problem.with_rig(anchored_at(self.problem.rig, base.model, base.values))
 
     # -- pieces -------------------------------------------------------------------------------------------------
     def effect(self, name: str) -> EffectType:
@@ -128,7 +126,7 @@ class Search:
         for p in self.effect(name).parameters:
             c = own[f"{name}.{p.name}"]
             if p.vanishing is None:
-                found = position_periods(self.problem, base, p.lower, p.upper) if p.period else ()
+                found = position_periods(self.seen(base), base, p.lower, p.upper) if p.period else ()
                 shapes.append([(c.name, c.z(v)) for v in (*(p.starts or (p.typical,)), *found)])
             else:
                 low, high = c.bounds
@@ -140,15 +138,14 @@ class Search:
                 trials += [(dict((*shape, one)), one) for one in group]
         # The amplitudes of one wave, or the halves of a difference, are right together only.
         joint = list(itertools.product(*shapes)) if len(strengths) > 1 else []
+        problem = self.seen(base)
         scored: list[list[tuple[float, dict[str, float]]]] = []
         for point in (base, self.prior_point(base)):
             here = {c.name: float(z) for c, z in zip(point.coordinates, point.z, strict=True)}
 
             def at(start: Mapping[str, float], here: dict[str, float] = here) -> Array:
                 z = {**here, **start}
-                return self.problem.residual(
-                    model, {c.name: c.value(z.get(c.name, 0.0)) for c in coordinates}
-                )
+                return problem.residual(model, {c.name: c.value(z.get(c.name, 0.0)) for c in coordinates})
 
             def score(
                 start: dict[str, float], residual: Array, point: Fit = point
@@ -187,7 +184,7 @@ class Search:
         strengths = [k for k, c in enumerate(coordinates) if c.name in own and c.name not in shape]
         here = {c.name: float(z) for c, z in zip(base.coordinates, base.z, strict=True)}
         z = np.array([{**here, **shape}.get(c.name, 0.0) for c in coordinates])
-        added = finite_differences(self.problem, model, coordinates, z, base.residual, strengths)
+        added = finite_differences(self.seen(base), model, coordinates, z, base.residual, strengths)
         prior = np.array([1.0 if c.prior else 0.0 for c in base.coordinates] + [0.0] * len(strengths))
         pull = np.concatenate([base.z, np.zeros(len(strengths))])
         a = np.vstack([np.column_stack([base.jacobian[use], added[use]]), np.diag(prior)])
@@ -221,8 +218,9 @@ class Search:
                 [0.0 if c.prior else float(v) for c, v in zip(base.coordinates, base.z, strict=True)]
             )
             values = {c.name: c.value(float(v)) for c, v in zip(base.coordinates, z, strict=True)}
-            r = self.problem.residual(base.model, values)
-            jacobian = finite_differences(self.problem, base.model, base.coordinates, z, r, range(z.size))
+            problem = self.seen(base)
+            r = problem.residual(base.model, values)
+            jacobian = finite_differences(problem, base.model, base.coordinates, z, r, range(z.size))
             self._prior_points[names] = Fit(base.model, base.coordinates, z, float(r @ r), r, jacobian)
         return self._prior_points[names]
 
@@ -251,9 +249,10 @@ class Search:
         known = {c.name: base.fit.jacobian[:, j] for j, c in enumerate(base.fit.coordinates) if c.prior}
         if starts is None:
             starts = [start for _, start in self.starts(name, base.fit, model, coordinates, KEEP)]
+        problem = self.seen(base.fit)
         tried = [
             fit(
-                self.problem,
+                problem,
                 model,
                 coordinates,
                 self._true_start(base.fit, model, coordinates, start),
@@ -276,11 +275,9 @@ class Search:
             return start
         kept = {**start, **{c.name: float(z) for c, z in zip(base.coordinates, base.z, strict=True)}}
         use = slice(None) if self.rows is None else self.rows
-        costs = []
+        problem, costs = self.seen(base), []
         for one in (start, kept):
-            r = self.problem.residual(model, {c.name: c.value(one.get(c.name, 0.0)) for c in coordinates})[
-                use
-            ]
+            r = problem.residual(model, {c.name: c.value(one.get(c.name, 0.0)) for c in coordinates})[use]
             costs.append(float(r @ r) + sum(one.get(c.name, 0.0) ** 2 for c in coordinates if c.prior))
         return start if costs[0] <= costs[1] else kept
 
@@ -294,7 +291,7 @@ class Search:
         """Refit from the candidate's point with all derivatives taken afresh."""
         old = candidate.fit
         new = self._settle(
-            fit(self.problem, old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
+            fit(self.seen(old), old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
         )
         if new.cost < old.cost:
             candidate = Candidate(candidate.names, new, candidate.penalised - old.cost + new.cost)
@@ -302,47 +299,22 @@ class Search:
         return candidate
 
     def _settle(self, found: Fit) -> Fit:
-        """A fit that was made on a slow plant seen through a fast one, carried on to the slow plant itself.
-
-        First the anchor moves to where the fit ends; then the slow plant's own derivatives are taken, which the fast
-        one's only resemble, and kept for a few steps.
-        """
-        rig = self.problem.rig
-        if not isinstance(rig, AnchoredRig):
-            return found
-        for _ in range(MOVES):
-            seen = replace(self.problem, rig=anchored_at(rig, found.model, found.values))
-            found = fit(seen, found.model, found.coordinates, found.z, rows=self.rows, evaluations=8)
-        exact = replace(self.problem, rig=rig.exact)
-        best: Fit | None = None
-        for _ in range(EXACT):
-            values = found.values
-            residual = exact.residual(found.model, values)
-            columns = finite_differences(
-                exact, found.model, found.coordinates, found.z, residual, range(found.z.size)
-            )
-            known = {c.name: columns[:, k] for k, c in enumerate(found.coordinates)}
-            found = fit(
-                exact, found.model, found.coordinates, found.z, rows=self.rows, known=known, evaluations=8
-            )
-            if best is not None and found.cost > best.cost - SETTLED:
-                break
-            best = found
-        self.problem.simulations, self.problem.failures = exact.simulations, exact.failures
-        return best if best is not None and best.cost <= found.cost else found
+        """The fit carried on to the slow plant itself, where there is one."""
+        return settle(self.problem, found, self.rows)[1]
 
     def renewed(self, best: Candidate) -> Search:
         """The same search with noise and scatter estimated at another point: sensitivities there are the true ones."""
         rig = anchored_at(self.problem.rig, best.fit.model, best.fit.values)
-        problem = build_problem(rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values)
-        problem.simulations, problem.failures = self.problem.simulations, self.problem.failures
+        problem = build_problem(
+            rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values, self.problem.counts
+        )
         return Search(problem, self.model, self.nuisances, self.sources, self.jobs, self.progress, self.rows)
 
     def refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
         """A candidate of another problem (other noise), fitted in this one from its point."""
         old = candidate.fit
         new = self._settle(
-            fit(self.problem, old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
+            fit(self.seen(old), old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
         )
         free = sum(1 for c in new.coordinates if not c.prior)
         out = Candidate(candidate.names, new, new.cost + PENALTY * free)
@@ -350,11 +322,13 @@ class Search:
         return out
 
     # -- rounds -------------------------------------------------------------------------------------------------
-    def extend(self, bases: Sequence[Candidate], names: Sequence[str], text: str) -> list[Candidate]:
+    def extend(
+        self, bases: Sequence[Candidate], names: Sequence[str], text: str, worth: float = np.inf
+    ) -> list[Candidate]:
         """The bases with one further effect each, sorted by penalised cost.
 
         All extensions are scanned; the REFIT most promising are refitted in closed loop, the POLISH best of them
-        with all derivatives taken afresh.
+        with all derivatives taken afresh, as far as their penalised cost is below `worth`.
         """
         todo: dict[Names, tuple[Candidate, str]] = {}
         for base in bases:
@@ -368,10 +342,10 @@ class Search:
         for candidate in refitted:
             self.found[tuple(sorted(candidate.names))] = candidate
         ranked = sorted(refitted, key=lambda c: c.penalised)
-        polished = self.each(_polish_in_worker, [(c,) for c in ranked[:POLISH]], f"{text}: polish")
+        polished = self.each(_polish_in_worker, [(c,) for c in ranked[:POLISH] if c.penalised < worth], f"{text}: polish")
         for candidate in polished:
             self.found[tuple(sorted(candidate.names))] = candidate
-        return sorted([*polished, *ranked[POLISH:]], key=lambda c: c.penalised)
+        return sorted([*polished, *ranked[len(polished) :]], key=lambda c: c.penalised)
 
     def each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
         """function(search, *item) for every item, in this process or in workers; the same results either way."""
@@ -387,8 +361,8 @@ class Search:
         merged: list[Any] = [None] * len(items)
         for k, (part, simulations, failures) in enumerate(results):
             merged[k :: self.jobs] = part
-            self.problem.simulations += simulations
-            self.problem.failures += failures
+            self.problem.counts.simulations += simulations
+            self.problem.counts.failures += failures
         self.progress(len(items), len(items), text)
         return merged
 
@@ -422,7 +396,7 @@ def _batch(
     arguments: tuple[Any, ...], function: Callable[..., Any], items: list[tuple[Any, ...]]
 ) -> tuple[list[Any], int, int]:
     problem, model, nuisances, sources, rows = arguments
-    problem.simulations = problem.failures = 0
+    problem.counts.simulations = problem.counts.failures = 0
     search = Search(problem, model, nuisances, sources, rows=rows)
     return [function(search, *item) for item in items], problem.simulations, problem.failures
 
