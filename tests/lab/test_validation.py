@@ -13,6 +13,7 @@ from hannes_lab.validation import convergence, currents, double_pendulum, fittin
 from hannes_lab.validation.cli import run as run_rows
 from hannes_lab.validation.double_pendulum import Pendulum
 from hannes_lab.validation.table import Figure, Section, markdown
+from scipy.signal import medfilt
 
 HAND = Model.load("thesis_hand")
 
@@ -93,6 +94,13 @@ def test_the_shipped_hand_says_what_was_fitted_to_what() -> None:
         if name in HAND.parameters:
             entry = HAND.parameters[name]
             assert entry.status == "identified" and "R12" in entry.source
+
+
+def test_a_finger_at_its_stop_does_not_strike_the_object() -> None:
+    """A contact's virtual mass times the jerk of a finger that strikes its own stop would spike the grip force."""
+    force = currents.simulate(HAND, currents.object_for(HAND, "soft")).force
+    assert force.max() > 5.0
+    assert np.abs(force - medfilt(force, 21)).max() < 0.3
 
 
 def test_wires_carts_and_energy_hold() -> None:

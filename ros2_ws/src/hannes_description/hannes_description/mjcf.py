@@ -48,7 +48,10 @@ PAIRS: tuple[tuple[str, str], tuple[str, str]] = (("index", "middle"), ("ring", 
 # Impedance of the constraints.  A row adds the virtual mass d / ((1 - d) A) to its own stretch (not to the common
 # motion of what it connects); it keeps light carts and fingers stable up to a step of 0.4 ms, and leaves stiffness and
 # damping exact.
-WIRE_IMPEDANCE, STOP_IMPEDANCE, CONTACT_IMPEDANCE = 0.9, 0.97, 0.5
+WIRE_IMPEDANCE, STOP_IMPEDANCE = 0.9, 0.97
+
+CONTACT_STEPS = 2.0
+"""Virtual mass of a contact: K t^2 + B t with t this many integration steps."""
 
 FRICTION_SOLREF, FRICTION_SOLIMP = (0.0005, 1.0), (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Dry friction: the creep speed under a load f is f A (1 - d) / b; the defaults creep by degrees a second."""
@@ -166,6 +169,18 @@ def direct_solref(stiffness: float, damping: float, impedance: float, weight: fl
     k = K (1 - d) A and b = B (1 - d) A, exact at rest whatever else moves with the row.
     """
     return -stiffness * (1.0 - impedance) * weight, -damping * (1.0 - impedance) * weight
+
+
+def contact_impedance(stiffness: float, damping: float, weight: float, dt: float) -> float:
+    """Impedance of one digit's contact of K [N/m] and B [N.s/m]: the least virtual mass that keeps it stable.
+
+    The mass K t^2 + B t, t = CONTACT_STEPS dt, is a fraction of a gram on a soft object.  A larger one would turn the
+    jerk of a finger that strikes its own stop into a spike of the grip force: the mass times the jerk, sideways too, and
+    MuJoCo's friction cone raises the normal force with the sideways one.
+    """
+    t = CONTACT_STEPS * dt
+    ratio = weight * t * (stiffness * t + damping)
+    return min(max(ratio / (1.0 + ratio), 1e-4), 0.9999)  # MuJoCo's own limits of an impedance
 
 
 def contact_stiffness(grasp: GraspShape) -> tuple[float, float]:
@@ -409,7 +424,7 @@ def _add_object(spec: mujoco.MjSpec, grasp: GraspShape, tree: tuple[Link, ...]) 
     for link in tree:
         if link.length > 0.0:
             spec.add_pair(name=f"object_{link.name}", geomname1="object", geomname2=link.name,
-                          condim=3 if grasp.friction > 0.0 else 1, solimp=_flat(CONTACT_IMPEDANCE),
+                          condim=3 if grasp.friction > 0.0 else 1,
                           friction=[max(grasp.friction, 1e-5)] * 2 + [0.0, 0.0, 0.0])
 
 
@@ -452,4 +467,6 @@ def _map_stiffness(spec: mujoco.MjSpec, parameters: Parameters, variant: Variant
         for pair in spec.pairs:
             bodies = [model.geom(name).bodyid[0] for name in (pair.geomname1, pair.geomname2)]
             weight = float(np.sum(model.body_invweight0[bodies, 0]))
-            pair.solref = list(direct_solref(stiffness, damping, CONTACT_IMPEDANCE, weight))
+            impedance = contact_impedance(stiffness, damping, weight, spec.option.timestep)
+            pair.solimp = _flat(impedance)
+            pair.solref = list(direct_solref(stiffness, damping, impedance, weight))

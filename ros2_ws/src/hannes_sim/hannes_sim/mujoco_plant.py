@@ -30,7 +30,7 @@ from hannes_description.errors import HannesError
 from hannes_description.joints import JOINT_LIMITS, JOINT_NAMES
 from hannes_description.mjcf import (
     CARTS,
-    CONTACT_IMPEDANCE,
+    CONTACT_STEPS,
     DRIVE,
     MASTER,
     MOTOR,
@@ -104,21 +104,23 @@ from .ports import (
 )  # fmt: skip
 
 # Parameters of this plant, after the common ones
-_RADIUS, _COULOMB, _VISCOUS, _TIP, _WIRE_K, _WIRE_B, _WIRE_GAIN, _OBJECT_B \
-    = range(N_PARAMETERS_COMMON, N_PARAMETERS_COMMON + 8)
-_N_PARAMETERS = N_PARAMETERS_COMMON + 8
+_RADIUS, _COULOMB, _VISCOUS, _TIP, _WIRE_K, _WIRE_B, _WIRE_GAIN, _OBJECT_K, _OBJECT_B \
+    = range(N_PARAMETERS_COMMON, N_PARAMETERS_COMMON + 9)
+_N_PARAMETERS = N_PARAMETERS_COMMON + 9
 
 # Entries of the handle after the common ones: addresses of MuJoCo's structs and arrays
 _MODEL, _DATA, _STEP, _COUNTS, _QPOS, _QVEL, _APPLIED, _FRICTION, _DAMPING, _ARMATURE, _WIRE_RANGE, _WIRE_SOLREF, \
-    _PAIR_SOLREF, _SENSORS, _WARNINGS, _TABLE, _MASS = range(N_HANDLE_COMMON, N_HANDLE_COMMON + 17)
-_N_HANDLE = N_HANDLE_COMMON + 17
+    _PAIR_SOLREF, _PAIR_SOLIMP, _SENSORS, _WARNINGS, _TABLE, _MASS = range(N_HANDLE_COMMON, N_HANDLE_COMMON + 18)
+_N_HANDLE = N_HANDLE_COMMON + 18
 
 # Counts: int64
 _C_NQ, _C_WIRES, _C_MOTOR, _C_TENSION, _C_GRIP, _C_PAIRS, _C_JOINTS = 0, 1, 2, 3, 4, 5, 6
 _N_COUNTS = _C_JOINTS + N_JOINTS
 
-# Table: float64 rows of N_JOINTS: J, w J, base dry friction, base damping; then the contact weights
+# Table: float64 rows of N_JOINTS: J, w J, base dry friction, base damping; then the contacts' weights A
 _T_J, _T_W, _T_FRICTION, _T_DAMPING, _T_PAIRS = 0, N_JOINTS, 2 * N_JOINTS, 3 * N_JOINTS, 4 * N_JOINTS
+
+_N_IMPEDANCE = mujoco.mjNIMP
 
 _FASTEST = 1e4
 """rad/s or m/s; beyond it the simulation has diverged."""
@@ -128,8 +130,6 @@ _FATAL = tuple(int(w) for w in (mujoco.mjtWarning.mjWARN_INERTIA, mujoco.mjtWarn
                                 mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC))
 _WARNING_SHIFT = 32  # mjWarningStat is (int lastinfo, int number); the count is the upper half of an int64
 _N_WARNINGS = len(_FATAL)
-_KEEP = 1.0 - WIRE_IMPEDANCE
-_CONTACT_KEEP = 1.0 - CONTACT_IMPEDANCE
 
 
 def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
@@ -178,10 +178,16 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
         if wires:
             pointer_f8(handle[_WIRE_RANGE])[1] = y[SLACK] * r
         if count[_C_PAIRS] > 0:
-            pairs = pointer_f8(handle[_PAIR_SOLREF])
-            extra = y[OBJECT_DAMPING] / (5.0 * p[_TIP] * p[_TIP])
+            pairs, impedance = pointer_f8(handle[_PAIR_SOLREF]), pointer_f8(handle[_PAIR_SOLIMP])
+            object_damping = p[_OBJECT_B] + y[OBJECT_DAMPING] / (5.0 * p[_TIP] * p[_TIP])
+            span = CONTACT_STEPS * p[P_DT]
             for j in range(count[_C_PAIRS]):
-                pairs[2 * j + 1] = -(p[_OBJECT_B] + extra) * table[_T_PAIRS + j]
+                # mjcf.contact_impedance: the damping of an effect may change from step to step
+                ratio = table[_T_PAIRS + j] * span * (p[_OBJECT_K] * span + object_damping)
+                share = min(max(ratio / (1.0 + ratio), 1e-4), 0.9999)
+                impedance[_N_IMPEDANCE * j] = impedance[_N_IMPEDANCE * j + 1] = share
+                pairs[2 * j] = -p[_OBJECT_K] * (1.0 - share) * table[_T_PAIRS + j]
+                pairs[2 * j + 1] = -object_damping * (1.0 - share) * table[_T_PAIRS + j]
 
         call_2(handle[_STEP], handle[_MODEL], handle[_DATA])
         s[S_TIME_STEPS] += 1.0
@@ -318,8 +324,7 @@ class MujocoPlant:
             self._table[_T_FRICTION + k], self._table[_T_DAMPING + k] = m.dof_frictionloss[dof], m.dof_damping[dof]
         for k in range(m.npair):
             bodies = m.geom_bodyid[[m.pair_geom1[k], m.pair_geom2[k]]]
-            self._table[_T_PAIRS + k] = -direct_solref(0.0, 1.0, CONTACT_IMPEDANCE,
-                                                       float(np.sum(m.body_invweight0[bodies, 0])))[1]
+            self._table[_T_PAIRS + k] = float(np.sum(m.body_invweight0[bodies, 0]))
 
         spare = self._delay.ctypes.data  # never read or written where the variant lacks the array
         addresses = [m._address, d._address, _STEP_ADDRESS, self._counts.ctypes.data, d.qpos.ctypes.data,
@@ -330,7 +335,8 @@ class MujocoPlant:
         p[_WIRE_GAIN] = -direct_solref(1.0, 0.0, WIRE_IMPEDANCE, float(m.tendon_invweight0[wire]))[0]
         stretch = m.tendon_solref_lim[wire] if wires else m.eq_solref[m.equality(DRIVE).id]
         addresses += [m.tendon_range[wire].ctypes.data, stretch.ctypes.data]
-        addresses += [m.pair_solref.ctypes.data if m.npair else spare, d.sensordata.ctypes.data if m.nsensor else spare,
+        addresses += [m.pair_solref.ctypes.data if m.npair else spare, m.pair_solimp.ctypes.data if m.npair else spare,
+                      d.sensordata.ctypes.data if m.nsensor else spare,
                       d.warning.number.ctypes.data - 4, self._table.ctypes.data, m.dof_M0.ctypes.data]
         self.handle[N_HANDLE_COMMON:] = addresses
         self._given = {"springlength": m.tendon_lengthspring.copy(), "rate": m.tendon_stiffness.copy(),
@@ -365,10 +371,7 @@ class MujocoPlant:
         if self.grasp is None:
             return
         m = self.model
-        stiffness, damping = contact_stiffness(self.grasp)
-        self.parameters[_OBJECT_B] = damping
-        for k in range(m.npair):
-            m.pair_solref[k, 0] = -stiffness * self._table[_T_PAIRS + k]
+        self.parameters[_OBJECT_K], self.parameters[_OBJECT_B] = contact_stiffness(self.grasp)
         if self.grasp.shape in PRISM_SIDES:
             return  # a mesh keeps the size that it was compiled with
         geom = m.geom("object").id
