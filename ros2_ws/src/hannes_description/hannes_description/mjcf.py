@@ -175,8 +175,8 @@ def contact_impedance(stiffness: float, damping: float, weight: float, dt: float
     """Impedance of one digit's contact of K [N/m] and B [N.s/m]: the least virtual mass that keeps it stable.
 
     The mass K t^2 + B t, t = CONTACT_STEPS dt, is a fraction of a gram on a soft object.  A larger one would turn the
-    jerk of a finger that strikes its own stop into a spike of the grip force: the mass times the jerk, sideways too, and
-    MuJoCo's friction cone raises the normal force with the sideways one.
+    jerk of a finger that strikes its own stop into a spike of the grip force: the mass times the jerk, sideways too,
+    and MuJoCo's friction cone raises the normal force with the sideways one.
     """
     t = CONTACT_STEPS * dt
     ratio = weight * t * (stiffness * t + damping)
