@@ -52,6 +52,8 @@ def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple
         scale = np.sqrt(n / (n - 1.0))
         for k in range(draws):
             raw[rows, k] = block.combine(s[k][:, None] * deviation) * scale
+    for own, lower in problem.discrepancy:
+        raw[own] += lower @ rng.standard_normal((own.size, draws))
     return problem.whiten(raw), True
 
 

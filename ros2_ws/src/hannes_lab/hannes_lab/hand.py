@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hannes_control.double_pid import DoublePID
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.parameters import data_path, read_yaml
@@ -25,8 +27,23 @@ __all__ = ["HandRig", "make_controller", "object_of", "sensors_of"]
 Array = NDArray[np.float64]
 
 _PER_OBJECT = ("object.stiffness", "object.position")
-_UNKNOWN_OBJECT_SD = {"object.stiffness": 2.0, "object.position": 2.0}
-"""Width of the priors where the recording does not say what was grasped."""
+
+_UNKNOWN_OBJECT_SD = {"object.stiffness": 1.5, "object.position": 2.0}
+"""Widths of the priors of an object of which only the kind is known (stiffness: of the logarithm; place: rad)."""
+
+_UNKNOWN_GAINS = {"control.kp": 0.2, "control.damping": 0.5, "control.current_kp": 1.2, "control.current_ki": 1.2}
+"""Gains of a controller that nobody described, with the widths of their priors (of the logarithm): the outer loop shows
+in the static error; of the inner one the thesis gives the order of magnitude."""
+
+REFERENCE_DELAY = "log.reference_delay"
+REFERENCE_DELAY_SD = 0.02
+"""s; how far the log's clock of the reference may be from that of the encoder: latencies, a reference that was logged
+after or before it was filtered."""
+
+CURRENT_WINDOW = "log.current_window"
+
+UNKNOWN_DISCREPANCY = 0.005
+"""Of a signal's span: how far the form of the model may be from a hand that is not this simulator's."""
 
 
 def object_of(trial: Trial) -> GraspObject | None:
@@ -63,8 +80,20 @@ def sensors_of(trial: Trial) -> dict[str, Any]:
     }
 
 
+def is_described(trial: Trial) -> bool:
+    """True where the recording says how it was logged: then clocks, gains and the named object are what they say.
+
+    Of any other recording (a real hand's, another simulator's) these are unknown, and fitted with wide priors.
+    """
+    return isinstance(trial.options.get("sensors"), Mapping)
+
+
 class HandRig(PlantRig):
-    """Simulates trials of the hand, on whichever plant the model names: objects, sensors and encoder zero per trial."""
+    """Simulates trials of the hand, on whichever plant the model names: objects, sensors and encoder zero per trial.
+
+    Where a recording does not say how it was logged, the clock of its reference, the window of its current logger and
+    the gains of its controller are nuisance parameters.
+    """
 
     population = data_path("parameters", "population.yaml")
     figures = True
@@ -72,6 +101,8 @@ class HandRig(PlantRig):
 
     def __init__(self, trials: Sequence[Trial]) -> None:
         super().__init__(trials)
+        if not all(is_described(trial) for trial in self.trials):
+            self.discrepancy = UNKNOWN_DISCREPANCY
         self._sensors = {trial.name: sensors_of(trial) for trial in self.trials}
 
     @classmethod
@@ -91,13 +122,34 @@ class HandRig(PlantRig):
                     if object_of(trial) is None:
                         continue
                     plant, _, _ = self._plant(model.without_effects(), trial)
-                    out.append(Nuisance(f"{name}@{trial.name}", plant.get(name), sd, relative, scatter))
+                    width = sd if is_described(trial) else _UNKNOWN_OBJECT_SD[name]
+                    out.append(Nuisance(f"{name}@{trial.name}", plant.get(name), width, relative, scatter))
             elif name == "encoder.zero":
                 out += [
                     Nuisance(f"{name}@{trial.name}", 0.0, sd, False, scatter, "rad") for trial in self.trials
                 ]
             elif model.parameters.value(name) > 0.0:
                 out.append(self._nuisance(name, entry, model))
+        return out + self._bench_nuisances(model)
+
+    def _bench_nuisances(self, model: Model) -> list[Nuisance]:
+        """What is unknown of controller and logger where a recording does not describe them."""
+        strange = [trial for trial in self.trials if not is_described(trial)]
+        out: list[Nuisance] = []
+        if strange and model.controller == "double_pid":
+            out += [
+                Nuisance(name, model.parameters.value(name), sd, True, unit=model.parameters[name].unit)
+                for name, sd in _UNKNOWN_GAINS.items()
+                if model.parameters.value(name) > 0.0
+            ]
+        logged = [t.signals["motor_current"][0] for t in strange if "motor_current" in t.signals]
+        if logged:
+            step = float(np.median(np.diff(logged[0])))
+            out.append(Nuisance(CURRENT_WINDOW, 0.5 * step, 1.0, True, unit="s"))
+        out += [
+            Nuisance(f"{REFERENCE_DELAY}@{trial.name}", 0.0, REFERENCE_DELAY_SD, False, unit="s")
+            for trial in strange
+        ]
         return out
 
     def plant(self, model: Model, trial: Trial) -> Plant:
@@ -106,12 +158,41 @@ class HandRig(PlantRig):
         plant.set("encoder.resolution", 0.0)
         return plant
 
-    def logged(self, run: Rollout, trial: Trial) -> dict[str, Array]:
+    def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
+        """The rollout itself; gains of the controller and the clock of the reference may be among the values."""
+        of_plant: dict[str, float] = {}
+        gains: dict[str, float] = {}
+        delay = 0.0
+        for name, value in values.items():
+            if name.startswith("control."):
+                gains[name.removeprefix("control.")] = value
+            elif name == f"{REFERENCE_DELAY}@{trial.name}":
+                delay = value
+            elif not name.startswith("log."):
+                of_plant[name] = value
+        _, controller, _ = self._plant(model, trial)
+        if isinstance(controller, DoublePID):
+            controller.parameters[:] = replace(controller.settings, **gains).to_array()
+        return super().run(model, of_plant, trial, _delayed(reference, delay, trial))
+
+    def simulate(
+        self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
+    ) -> dict[str, Array]:
+        """See Rig."""
+        window = None if is_described(trial) else values.get(CURRENT_WINDOW)
+        return self.logged(self.run(model, values, trial, reference), trial, window)
+
+    def logged(self, run: Rollout, trial: Trial, window: float | None = None) -> dict[str, Array]:
         """Signals as the hand's loggers show them: the current filtered, and rectified where it was."""
         logged = self._sensors[trial.name]
-        current = logger(
-            run.motor_current, trial.period, rectified=logged["rectified"], window=logged["window"]
-        )
+        if window is None:
+            current = logger(
+                run.motor_current, trial.period, rectified=logged["rectified"], window=logged["window"]
+            )
+        else:
+            current = _moving_mean(
+                np.abs(run.motor_current) if logged["rectified"] else run.motor_current, window / trial.period
+            )
         if logged["rectified"]:
             current = folded_mean(current, logged["noise"])
         return {
@@ -121,3 +202,22 @@ class HandRig(PlantRig):
             "grip_force": run.grip_force,
             "motor_effort": run.motor_effort,
         }
+
+
+def _delayed(reference: Array, delay: float, trial: Trial) -> Array:
+    """The reference later by `delay` [s]; what comes after a cut reference is that of the trial."""
+    if delay == 0.0:
+        return reference
+    n = reference.size
+    whole = trial.reference if np.array_equal(trial.reference[:n], reference) else reference
+    ticks = np.arange(whole.size, dtype=np.float64)
+    return np.interp(ticks[:n] - delay / trial.period, ticks, whole)
+
+
+def _moving_mean(values: Array, width: float) -> Array:
+    """Mean over the trailing `width` ticks; unlike `logger`, continuous in the width."""
+    ticks = np.arange(values.size + 1, dtype=np.float64)
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    end = ticks[1:]
+    begin = np.maximum(end - max(width, 1.0), 0.0)
+    return (total[1:] - np.interp(begin, ticks, total)) / (end - begin)

@@ -6,6 +6,10 @@ encoder zero ...), whose sensitivities are known, so that 13 closures are enough
 
     C_c = (diag(v) + J_c S J_c^T) / n        per condition c; v smoothed sample variance, S = diag(scatter variances)
 
+Where the model's form is not exactly that of the machine (a real hand, another simulator) its own error is added, which
+does not average out over the closures: a smooth random curve of `rig.discrepancy` times the signal's span (Kennedy,
+O'Hagan 2001, with a fixed width).
+
 Whitened residual: L_c^{-1} (measured - predicted), C_c = L_c L_c^T.
 """
 
@@ -21,10 +25,13 @@ from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from .features import Features
+from .features import Block, Features
 from .rig import Nuisance, Rig
 
 Array = NDArray[np.float64]
+
+DISCREPANCY_LENGTH = 0.1
+"""Part of a closure over which the model's own error stays alike."""
 
 FAILED = 1e3
 """Whitened residual of a simulation that diverged: a large finite penalty."""
@@ -137,6 +144,7 @@ class Problem:
 
     whitener    per condition, rows of the features and the Cholesky factor of their covariance
     deviations  per block (n, p), scatter of the closures: what the model does not predict of their differences
+    discrepancy  rows of the features and the Cholesky factor of the covariance of the model's own error, where it has one
     """
 
     rig: Rig
@@ -144,6 +152,7 @@ class Problem:
     whitener: tuple[tuple[NDArray[np.int64], Array], ...]
     deviations: tuple[Array, ...]
     counts: Counts = field(default_factory=Counts)
+    discrepancy: tuple[tuple[NDArray[np.int64], Array], ...] = ()
     _measured: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -217,6 +226,7 @@ def build_problem(
         columns.append([(m - b).mean(axis=0) * factor for m, b in zip(moved, base, strict=True)])
 
     whitener = []
+    discrepancy = []
     for condition in features.conditions:
         own = [k for k, block in enumerate(features.blocks) if block.condition == condition]
         n = features.blocks[own[0]].n
@@ -235,9 +245,31 @@ def build_problem(
             rows = np.concatenate(
                 [np.arange(features.slices[k].start + a, features.slices[k].start + b) for k, a, b in part]
             )
-            if rows.size:
-                whitener.append((rows, np.linalg.cholesky(single / count)))
-    return Problem(rig, features, tuple(whitener), tuple(deviations), counts or Counts())
+            if not rows.size:
+                continue
+            covariance = single / count
+            if rig.discrepancy > 0.0 and part[0][1] == 0:
+                own_error = _own_error([features.blocks[k] for k in own], rig.discrepancy)
+                covariance = covariance + own_error
+                discrepancy.append((rows, np.linalg.cholesky(own_error)))
+            whitener.append((rows, np.linalg.cholesky(covariance)))
+    return Problem(
+        rig, features, tuple(whitener), tuple(deviations), counts or Counts(), tuple(discrepancy)
+    )
+
+
+def _own_error(blocks: Sequence[Block], relative: float) -> Array:
+    """Covariance of the model's own error over the phases of these blocks, one after another."""
+    out = np.zeros((sum(b.phase.size for b in blocks),) * 2)
+    at = 0
+    for block in blocks:
+        length = DISCREPANCY_LENGTH * float(block.phase[-1] - block.phase[0])
+        apart = np.abs(block.phase[:, None] - block.phase[None, :]) / length
+        sd = relative * (float(np.ptp(block.measured)) or 1.0)
+        own = slice(at, at + block.phase.size)
+        out[own, own] = sd**2 * np.exp(-apart)
+        at += block.phase.size
+    return out
 
 
 def _pooled(features: Features, variances: Sequence[Array]) -> list[Array]:

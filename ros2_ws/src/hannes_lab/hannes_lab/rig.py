@@ -74,6 +74,8 @@ class Rig(Protocol):
     trials    what was recorded
     floor     smallest standard deviation of a sample, relative to the span of its signal, that the simulation of a
               logged reference can promise
+    discrepancy  how far the best parameters may leave the model from the machine, relative to the span of a signal: no
+              model has exactly the machine's form.  0: a difference of any size counts
     points    points of the phase grid of one closure at most
     without   effects that have no meaning on this machine, with the reason
     drive_signals  signals that tell force or torque of the drive
@@ -86,6 +88,7 @@ class Rig(Protocol):
 
     trials: tuple[Trial, ...]
     floor: float
+    discrepancy: float
     points: int
     drive_signals: tuple[str, ...]
     pooled: bool
@@ -123,7 +126,7 @@ class PlantRig:
                  from REFERENCE_SIZES; effects are scaled by them
     linear       True where position is in m and the drive gives N: units are named so
     without      effects that have no meaning here, with the reason
-    floor, points, drive_signals, pooled, phases, figures, experiments  see Rig
+    floor, discrepancy, points, drive_signals, pooled, phases, figures, experiments  see Rig
 
     Plants are built once per (model structure, trial) and then only re-parametrised.
     """
@@ -134,6 +137,7 @@ class PlantRig:
     linear: ClassVar[bool] = False
     without: Mapping[str, str] = {}
     floor: float = 2e-4  # replay of a reference logged by messages, and a plant of finite step
+    discrepancy: float = 0.0
     points: int = 160
     drive_signals: tuple[str, ...] = ("motor_current", "motor_effort")
     pooled: bool = False

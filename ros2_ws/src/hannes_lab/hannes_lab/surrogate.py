@@ -52,6 +52,7 @@ class AnchoredRig:
         self.exact = exact
         self.trials = exact.trials
         self.floor, self.points, self.pooled = exact.floor, exact.points, exact.pooled
+        self.discrepancy = exact.discrepancy
         self.drive_signals, self.without = exact.drive_signals, exact.without
         self.phases, self.figures, self.experiments = exact.phases, exact.figures, exact.experiments
         self._model, self._values = model, dict(values)
