@@ -13,6 +13,7 @@ from hannes_sim.plant import PlantDiverged
 
 from .chance import chance
 from .diagnose import Fall, FoundEffect, error_falls, fitted_model, found_effects
+from .executor import Executor
 from .features import data_used
 from .prepare import Prepared
 from .search import Progress, Search, silent
@@ -46,23 +47,37 @@ class Addition:
         }
 
 
-def add_effects(prepared: Prepared, sources: Mapping[str, str], *, progress: Progress = silent) -> Addition:
+def add_effects(
+    prepared: Prepared,
+    sources: Mapping[str, str],
+    *,
+    executor: Executor | None = None,
+    progress: Progress = silent,
+) -> Addition:
     """Fit the effects one after another in the given order, all parameters free from the first on.
 
     sources   effect name -> what load_effect takes
+    executor  where the work is done, and where its results are kept; this process if None
     """
     if not sources:
         raise HannesError(
             "No effect to add: give --effect NAME (see `hannes model effects`) or path.py:Class."
         )
     check_effects(prepared, sources)
-    search = Search(prepared.problem, prepared.model, prepared.nuisances, sources, progress=progress)
+    search = Search(
+        prepared.problem,
+        prepared.model,
+        prepared.nuisances,
+        sources,
+        executor=executor or Executor(),
+        progress=progress,
+    )
     best = search.null()
     for k, name in enumerate(sources):
         progress(k, len(sources), f"fit with {name}")
         best = search.polish(search.add(best, name))
     limits = chance(prepared.problem, search.null().fit, {})
-    falls = error_falls(prepared, search, best, progress)
+    falls = error_falls(prepared, search, best)
     return Addition(
         with_provenance(fitted_model(prepared.model, search, best), prepared, falls),
         found_effects(search, best, limits, falls),

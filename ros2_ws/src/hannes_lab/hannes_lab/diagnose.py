@@ -21,6 +21,7 @@ from .errors import (
     per_signal,
     signal_errors,
 )
+from .executor import Executor
 from .experiments import Experiment, separating_experiments
 from .features import Features, data_used
 from .fit import Fit
@@ -31,6 +32,7 @@ from .rig import Rig
 from .screen import usable_effects
 from .search import Candidate, Progress, Search, silent
 from .settle import slopes_at
+from .surrogate import exact_rig
 
 Array = NDArray[np.float64]
 
@@ -193,12 +195,14 @@ def diagnose(
     sources: Mapping[str, str],
     *,
     jobs: int = 1,
+    executor: Executor | None = None,
     progress: Progress = silent,
     max_effects: int = MAX_EFFECTS,
     greedy: bool = False,
 ) -> Diagnosis:
     """Search the catalogue; see the module docstrings of search, chance and problem for the method.
 
+    executor  where the work is done, and where its results are kept; `jobs` processes if None
     greedy   add effects one after another as long as the error on held-out conditions falls (greedy.py), instead of
              looking for the smallest set that explains all
     """
@@ -206,7 +210,12 @@ def diagnose(
     sources = usable.sources
     prepared = replace(prepared, notes=(*prepared.notes, *usable.notes))
     search = Search(
-        prepared.problem, prepared.model, prepared.nuisances, sources, jobs=jobs, progress=progress
+        prepared.problem,
+        prepared.model,
+        prepared.nuisances,
+        sources,
+        executor=executor or Executor(jobs),
+        progress=progress,
     )
     null = search.null()
     limits = chance(search.problem, null.fit, search.signatures(null))
@@ -224,7 +233,7 @@ def diagnose(
     verdict = "nothing" if nothing else "effects" if adequate or (greedy and best.names) else "unknown"
     tied = _ties(choice) if verdict == "effects" else ()
     model = fitted_model(prepared.model, search, best) if best.names else prepared.model
-    falls = error_falls(prepared, search, best, progress, in_order=greedy)
+    falls = error_falls(prepared, search, best, in_order=greedy)
     if verdict == "unknown":
         best, falls = _worth_showing(search, best, falls)
         model = fitted_model(prepared.model, search, best) if best.names else prepared.model
@@ -411,23 +420,19 @@ def found_effects(
     return tuple(_found(search, best, name, limits, falls) for name in best.names)
 
 
-def problem_builder(prepared: Prepared, rig: Rig, values: Mapping[str, float]) -> Any:
+def _problem_builder(search: Search, rig: Rig, values: Mapping[str, float]) -> Any:
     """A function from Features to a Problem with noise estimated on those features."""
 
     def build(features: Features) -> Problem:
-        return build_problem(
-            rig,
-            features,
-            prepared.model,
-            prepared.nuisances,
-            {n.name: values.get(n.name, n.mean) for n in prepared.nuisances},
-        )
+        nuisances = search.nuisances
+        values_there = {n.name: values.get(n.name, n.mean) for n in nuisances}
+        return build_problem(rig, features, search.model, nuisances, values_there)
 
     return build
 
 
 def error_falls(
-    prepared: Prepared, search: Search, best: Candidate, progress: Progress, *, in_order: bool = False
+    prepared: Prepared, search: Search, best: Candidate, *, in_order: bool = False
 ) -> tuple[Fall, ...]:
     """Nominal as given, nominal fitted, then the effects one after another in the order that helps most.
 
@@ -456,18 +461,23 @@ def error_falls(
         pick = min(range(len(options)), key=lambda k: options[k].penalised)
         chain = (*chain, left[pick])
         steps.append((left.pop(pick), options[pick]))
-    for k, (label, candidate) in enumerate(steps):
-        progress(k, len(steps), f"held-out error: {label}")
-        f = candidate.fit
-        rig = slopes_at(search.problem.rig, f)
-        build = problem_builder(prepared, rig, best.fit.values)
-        problem = replace(search.problem, rig=rig)
-        train, test = held_out_closures(build, features, f.model, f.coordinates, f.z)
-        held = held_out_condition_errors(problem, f.model, f.coordinates, f.z)
-        by_condition = {condition: overall(own) for condition, own in held.items()}
-        errors = signal_errors(features, features.closures(prepared.rig, f.model, f.values))
-        falls.append(Fall(label, train, test, by_condition, errors, per_signal(features, held.values())))
+    held = search.each(_fall_in_worker, [(c, best.fit.values) for _, c in steps], "held-out error")
+    for (label, _), found in zip(steps, held, strict=True):
+        falls.append(Fall(label, *found))
     return tuple(falls)
+
+
+def _fall_in_worker(search: Search, candidate: Candidate, values: Mapping[str, float]) -> tuple[Any, ...]:
+    """What a Fall holds of one fitted set; the noise is estimated at `values`."""
+    f = candidate.fit
+    features = search.problem.features
+    problem = search.problem.with_rig(slopes_at(search.problem.rig, f))
+    build = _problem_builder(search, problem.rig, values)
+    train, test = held_out_closures(build, features, f.model, f.coordinates, f.z)
+    held = held_out_condition_errors(problem, f.model, f.coordinates, f.z)
+    by_condition = {condition: overall(own) for condition, own in held.items()}
+    errors = signal_errors(features, features.closures(exact_rig(problem.rig), f.model, f.values))
+    return train, test, by_condition, errors, per_signal(features, held.values())
 
 
 def _nuisance_table(found: Fit) -> dict[str, dict[str, Any]]:

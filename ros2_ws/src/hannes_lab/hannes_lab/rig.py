@@ -155,6 +155,10 @@ class PlantRig:
         # A class from a user's file cannot be imported by name in another process.
         return (_rebuild, (self.source or type(self), self.trials))
 
+    def identity(self) -> tuple[Any, ...]:
+        """What its simulations depend on beside the model: for the hash under which results are kept."""
+        return (self.source or type(self), self.trials)
+
     @classmethod
     def read(cls, paths: Sequence[Path]) -> list[Trial]:
         """Trials of the given files; raises HannesError that names the file."""

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from hannes_description.model import Model
 from hannes_sim.effect import EffectType, load_effect
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
+from .cache import Codec, NotPlain, Store, code_hash, content_hash
+from .errors import SignalError
+from .executor import Executor, Held, own
 from .fit import Fit, finite_differences, fit
 from .problem import (
     Coordinate,
+    Counts,
     Problem,
     build_problem,
     effect_coordinates,
@@ -77,11 +83,12 @@ class Search:
     model: Model
     nuisances: Sequence[Nuisance]
     sources: Mapping[str, str]
-    jobs: int = 1
+    executor: Executor = field(default_factory=Executor)
     progress: Progress = silent
     rows: NDArray[np.bool_] | None = None
     found: dict[Names, Candidate] = field(default_factory=dict)
-    _prior_points: dict[Names, Fit] = field(default_factory=dict)
+    _prior_points: dict[tuple[Names, bytes], Fit] = field(default_factory=dict)
+    _key: str = ""
 
     def __post_init__(self) -> None:
         self.coordinates = tuple(nuisance_coordinate(n) for n in self.nuisances)
@@ -97,11 +104,14 @@ class Search:
     def null(self) -> Candidate:
         """The model as it is, with its nuisance parameters fitted."""
         if () not in self.found:
-            best = self._settle(
-                fit(self.problem, self.model, self.coordinates, {}, rows=self.rows, evaluations=25)
-            )
-            self.found[()] = Candidate((), best, best.cost)
+            self.found[()] = self.once(_null_in_worker, text="nominal: fit")
         return self.found[()]
+
+    def _null(self) -> Candidate:
+        best = self._settle(
+            fit(self.problem, self.model, self.coordinates, {}, rows=self.rows, evaluations=25)
+        )
+        return Candidate((), best, best.cost)
 
     def with_effects(self, names: Names) -> tuple[Model, tuple[Coordinate, ...]]:
         """The model with the effects switched off but movable, and the coordinates to move."""
@@ -212,8 +222,8 @@ class Search:
 
         A fit without the true effect may have driven a nuisance parameter far off; the truth is near the prior's mean.
         """
-        names = tuple(dict.fromkeys(c.name.split(".")[0] for c in base.coordinates if not c.prior))
-        if names not in self._prior_points:
+        key = _point_of(base)
+        if key not in self._prior_points:
             z = np.array(
                 [0.0 if c.prior else float(v) for c, v in zip(base.coordinates, base.z, strict=True)]
             )
@@ -221,8 +231,8 @@ class Search:
             problem = self.seen(base)
             r = problem.residual(base.model, values)
             jacobian = finite_differences(problem, base.model, base.coordinates, z, r, range(z.size))
-            self._prior_points[names] = Fit(base.model, base.coordinates, z, float(r @ r), r, jacobian)
-        return self._prior_points[names]
+            self._prior_points[key] = Fit(base.model, base.coordinates, z, float(r @ r), r, jacobian)
+        return self._prior_points[key]
 
     def compensated(self, residual: Array, base: Fit) -> tuple[float, Array]:
         """Cost of a residual after the linear best move of the base fit's coordinates, and where they move to."""
@@ -245,6 +255,10 @@ class Search:
         self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None = None
     ) -> Candidate:
         """Fit the base set plus one effect, from the best points of the scan (or the given ones)."""
+        found: Candidate = self.once(_add_in_worker, base, name, starts, text=f"fit with {name}")
+        return self._known(found)
+
+    def _add(self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None) -> Candidate:
         model, coordinates = self.with_effects((*base.names, name))
         known = {c.name: base.fit.jacobian[:, j] for j, c in enumerate(base.fit.coordinates) if c.prior}
         if starts is None:
@@ -283,19 +297,24 @@ class Search:
 
     def _keep(self, base: Candidate, name: str, best: Fit) -> Candidate:
         free = sum(1 for c in best.coordinates if not c.prior)
-        candidate = Candidate((*base.names, name), best, best.cost + PENALTY * free)
+        return Candidate((*base.names, name), best, best.cost + PENALTY * free)
+
+    def _known(self, candidate: Candidate) -> Candidate:
         self.found[tuple(sorted(candidate.names))] = candidate
         return candidate
 
     def polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
         """Refit from the candidate's point with all derivatives taken afresh."""
+        found: Candidate = self.once(_polish_in_worker, candidate, evaluations, text="polish")
+        return self._known(found)
+
+    def _polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
         old = candidate.fit
         new = self._settle(
             fit(self.seen(old), old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
         )
         if new.cost < old.cost:
             candidate = Candidate(candidate.names, new, candidate.penalised - old.cost + new.cost)
-            self.found[tuple(sorted(candidate.names))] = candidate
         return candidate
 
     def _settle(self, found: Fit) -> Fit:
@@ -308,18 +327,20 @@ class Search:
         problem = build_problem(
             rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values, self.problem.counts
         )
-        return Search(problem, self.model, self.nuisances, self.sources, self.jobs, self.progress, self.rows)
+        return Search(problem, self.model, self.nuisances, self.sources, self.executor, self.progress, self.rows)
 
     def refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
         """A candidate of another problem (other noise), fitted in this one from its point."""
+        found: Candidate = self.once(_refit_in_worker, candidate, evaluations, text="refit")
+        return self._known(found)
+
+    def _refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
         old = candidate.fit
         new = self._settle(
             fit(self.seen(old), old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
         )
         free = sum(1 for c in new.coordinates if not c.prior)
-        out = Candidate(candidate.names, new, new.cost + PENALTY * free)
-        self.found[tuple(sorted(out.names))] = out
-        return out
+        return Candidate(candidate.names, new, new.cost + PENALTY * free)
 
     # -- rounds -------------------------------------------------------------------------------------------------
     def extend(
@@ -335,6 +356,8 @@ class Search:
             for name in names:
                 if name not in base.names:
                     todo.setdefault(tuple(sorted((*base.names, name))), (base, name))
+        points = self.each(_prior_in_worker, [(base,) for base in bases], f"{text}: nominal values")
+        self._prior_points = {_point_of(base.fit): point for base, point in zip(bases, points, strict=True)}
         scans = self.each(_scan_in_worker, list(todo.values()), f"{text}: scan")
         order = sorted(zip(todo.values(), scans, strict=True), key=lambda item: item[1][0][0])
         chosen = [(base, name, [s for _, s in starts]) for (base, name), starts in order[:REFIT]]
@@ -342,63 +365,148 @@ class Search:
         for candidate in refitted:
             self.found[tuple(sorted(candidate.names))] = candidate
         ranked = sorted(refitted, key=lambda c: c.penalised)
-        polished = self.each(_polish_in_worker, [(c,) for c in ranked[:POLISH] if c.penalised < worth], f"{text}: polish")
+        worthy = [(c,) for c in ranked[:POLISH] if c.penalised < worth]
+        polished = self.each(_polish_in_worker, worthy, f"{text}: polish")
         for candidate in polished:
             self.found[tuple(sorted(candidate.names))] = candidate
         return sorted([*polished, *ranked[len(polished) :]], key=lambda c: c.penalised)
 
     def each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
-        """function(search, *item) for every item, in this process or in workers; the same results either way."""
-        out = []
-        if self.jobs == 1 or len(items) < 2:
-            for k, item in enumerate(items):
-                out.append(function(self, *item))
-                self.progress(k + 1, len(items), text)
-            return out
-        arguments = (self.problem, self.model, tuple(self.nuisances), dict(self.sources), self.rows)
-        batches = [list(items[k :: self.jobs]) for k in range(self.jobs)]
-        results = Parallel(n_jobs=self.jobs)(delayed(_batch)(arguments, function, batch) for batch in batches)
-        merged: list[Any] = [None] * len(items)
-        for k, (part, simulations, failures) in enumerate(results):
-            merged[k :: self.jobs] = part
+        """function(search, *item) for every item, wherever the executor works; the same results everywhere.
+
+        What is in the executor's store is taken from there; each result goes there as soon as it is made.
+        """
+        store = self.executor.store
+        keys = self._keys(function, items) if store else {}
+        out: list[Any] = [None] * len(items)
+        missing = []
+        for k in range(len(items)):
+            kept = self._stored(store, keys[k]) if store and k in keys else None
+            if kept is None:
+                missing.append(k)
+            else:
+                out[k] = kept
+        done = len(items) - len(missing)
+        for k, result in self._made(function, items, missing):
+            out[k] = result
+            if store and k in keys:
+                with suppress(NotPlain):
+                    store.write(keys[k], self._codec.pack(result))
+            done += 1
+            self.progress(done, len(items), text)
+        return out
+
+    def once(self, function: Callable[..., Any], *item: Any, text: str) -> Any:
+        """One item in this process; from the store if it is there."""
+        return self.each(function, [item], text)[0]
+
+    def _made(
+        self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], missing: Sequence[int]
+    ) -> Iterator[tuple[int, Any]]:
+        if self.executor.serial or len(missing) < 2:
+            bare = replace(self, executor=Executor(), progress=silent)
+            for k in missing:
+                yield k, function(bare, *items[k])
+            return
+        shared = (self.problem, self.model, tuple(self.nuisances), dict(self.sources), self.rows)
+        work = [(function, items[k]) for k in missing]
+        key = f"{next(_runs)} {id(self)} {os.getpid()} {time.time_ns()}"
+        for number, (result, simulations, failures) in self.executor.run(
+            _work, (*shared, self._prior_points), key, work
+        ):
             self.problem.counts.simulations += simulations
             self.problem.counts.failures += failures
-        self.progress(len(items), len(items), text)
-        return merged
+            yield missing[number], result
+
+    @property
+    def _codec(self) -> Codec:
+        return Codec(self.with_effects, (Candidate, SignalError))
+
+    def _keys(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]]) -> dict[int, str]:
+        """Hash of all that an item's result depends on; none for items of which that cannot be told."""
+        out = {}
+        with suppress(NotPlain):
+            self._key = self._key or content_hash(
+                code_hash(), self.problem, self.model, tuple(self.nuisances), dict(self.sources), self.rows
+            )
+            for k, item in enumerate(items):
+                out[k] = content_hash(self._key, function.__module__, function.__qualname__, item)
+        return out
+
+    def _stored(self, store: Store, key: str) -> Any | None:
+        content = store.read(key)
+        try:
+            return None if content is None else self._codec.unpack(content)
+        except (KeyError, TypeError, ValueError):
+            return None
 
     def signatures(self, base: Candidate) -> dict[str, list[Array]]:
         """Whitened derivative of each effect at vanishing strength, per shape start; for what chance reaches."""
-        out: dict[str, list[Array]] = {}
+        names = [name for name in self.sources if name not in base.names]
+        found = self.each(_signature_in_worker, [(base, name) for name in names], "what chance reaches")
+        return dict(zip(names, found, strict=True))
+
+    def _signature(self, base: Candidate, name: str) -> list[Array]:
         here = {c.name: c.value(float(z)) for c, z in zip(base.fit.coordinates, base.fit.z, strict=True)}
-        for name in self.sources:
-            if name in base.names:
-                continue
-            kind = self.effect(name)
-            model, coordinates = self.with_effects((*base.names, name))
-            own = [c for c in coordinates if c.name.startswith(f"{name}.")]
-            shapes = [
-                [(f"{name}.{p.name}", v) for v in (p.starts or (p.typical,))]
-                for p in kind.parameters
-                if p.vanishing is None
-            ]
-            strengths = [c for c, p in zip(own, kind.parameters, strict=True) if p.vanishing is not None]
-            out[name] = []
-            for shape in itertools.product(*shapes):
-                z = np.array([c.z({**here, **dict(shape)}.get(c.name, c.offset)) for c in coordinates])
-                values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
-                r = self.problem.residual(model, values)
-                columns = [coordinates.index(c) for c in strengths]
-                out[name].append(finite_differences(self.problem, model, coordinates, z, r, columns))
+        kind = self.effect(name)
+        model, coordinates = self.with_effects((*base.names, name))
+        own = [c for c in coordinates if c.name.startswith(f"{name}.")]
+        shapes = [
+            [(f"{name}.{p.name}", v) for v in (p.starts or (p.typical,))]
+            for p in kind.parameters
+            if p.vanishing is None
+        ]
+        strengths = [c for c, p in zip(own, kind.parameters, strict=True) if p.vanishing is not None]
+        out = []
+        for shape in itertools.product(*shapes):
+            z = np.array([c.z({**here, **dict(shape)}.get(c.name, c.offset)) for c in coordinates])
+            values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
+            r = self.problem.residual(model, values)
+            columns = [coordinates.index(c) for c in strengths]
+            out.append(finite_differences(self.problem, model, coordinates, z, r, columns))
         return out
 
 
-def _batch(
-    arguments: tuple[Any, ...], function: Callable[..., Any], items: list[tuple[Any, ...]]
-) -> tuple[list[Any], int, int]:
-    problem, model, nuisances, sources, rows = arguments
-    problem.counts.simulations = problem.counts.failures = 0
-    search = Search(problem, model, nuisances, sources, rows=rows)
-    return [function(search, *item) for item in items], problem.simulations, problem.failures
+_runs = itertools.count()
+_held = Held()
+
+
+def _work(
+    shared: tuple[Any, ...], key: str, function: Callable[..., Any], item: tuple[Any, ...]
+) -> tuple[Any, int, int]:
+    """One item in a worker, which keeps the search for the next ones: (result, simulations, failures)."""
+
+    def build() -> Search:
+        problem, model, nuisances, sources, rows, points = shared
+        problem = replace(problem, rig=own(problem.rig), counts=Counts())
+        return Search(problem, model, nuisances, sources, rows=rows, _prior_points=dict(points))
+
+    search = _held.get(key, build)
+    counts = search.problem.counts
+    counts.simulations = counts.failures = 0
+    result = function(search, *item)
+    return result, counts.simulations, counts.failures
+
+
+def _point_of(base: Fit) -> tuple[Names, bytes]:
+    names = tuple(dict.fromkeys(c.name.split(".")[0] for c in base.coordinates if not c.prior))
+    return names, base.z.tobytes()
+
+
+def _null_in_worker(search: Search) -> Candidate:
+    return search._null()
+
+
+def _prior_in_worker(search: Search, base: Candidate) -> Fit:
+    return search.prior_point(base.fit)
+
+
+def _signature_in_worker(search: Search, base: Candidate, name: str) -> list[Array]:
+    return search._signature(base, name)
+
+
+def _refit_in_worker(search: Search, candidate: Candidate, evaluations: int) -> Candidate:
+    return search._refit(candidate, evaluations)
 
 
 def _scan_in_worker(search: Search, base: Candidate, name: str) -> list[tuple[float, dict[str, float]]]:
@@ -406,9 +514,11 @@ def _scan_in_worker(search: Search, base: Candidate, name: str) -> list[tuple[fl
     return search.starts(name, base.fit, model, coordinates, KEEP)
 
 
-def _add_in_worker(search: Search, base: Candidate, name: str, starts: list[dict[str, float]]) -> Candidate:
-    return search.add(base, name, starts)
+def _add_in_worker(
+    search: Search, base: Candidate, name: str, starts: list[dict[str, float]] | None
+) -> Candidate:
+    return search._add(base, name, starts)
 
 
-def _polish_in_worker(search: Search, candidate: Candidate) -> Candidate:
-    return search.polish(candidate)
+def _polish_in_worker(search: Search, candidate: Candidate, evaluations: int = 15) -> Candidate:
+    return search._polish(candidate, evaluations)

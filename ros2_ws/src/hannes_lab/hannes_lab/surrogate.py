@@ -63,6 +63,10 @@ class AnchoredRig:
     def __reduce__(self) -> tuple[Any, ...]:
         return AnchoredRig, (self.exact, self._model, self._values, self._slopes, self._corrections)
 
+    def identity(self) -> tuple[Any, ...]:
+        """See PlantRig."""
+        return ("anchored", self.exact, self._model, self._values, self._slopes)
+
     def anchored(self, model: Model, values: Mapping[str, float]) -> AnchoredRig:
         """The same with another anchor; slopes change little along the way and stay."""
         return AnchoredRig(self.exact, model, values, self._slopes, self._corrections)
@@ -143,6 +147,10 @@ class _Slope:
     def __init__(self, coordinate: Coordinate, signals: Mapping[str, Array]) -> None:
         self.coordinate, self.signals = coordinate, signals
 
+    def identity(self) -> tuple[Any, ...]:
+        """See PlantRig."""
+        return (self.coordinate, self.signals)
+
     def away(self, value: float, anchor: Mapping[str, float]) -> float:
         """Distance of a value from the anchor, in z."""
         c = self.coordinate
@@ -170,6 +178,11 @@ def rig_for(rig: Rig, model: Model) -> Rig:
     if model.plant in SLOW_PLANTS and isinstance(rig, PlantRig):
         return AnchoredRig(rig, model, {})
     return rig
+
+
+def exact_rig(rig: Rig) -> Rig:
+    """The rig that simulates the model's own plant."""
+    return rig.exact if isinstance(rig, AnchoredRig) else rig
 
 
 def anchored_at(rig: Rig, model: Model, values: Mapping[str, float]) -> Rig:

@@ -1,0 +1,138 @@
+"""Where the items of a search are worked on: in this process, in worker processes, or on a Dask cluster.
+
+Every item is a pure function of a search and its arguments, so the results are the same wherever it runs.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import typer
+from hannes_description.errors import HannesError
+from joblib import Parallel, delayed, parallel_config
+from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+from .cache import Store, code_hash
+
+Work = Callable[..., Any]
+"""(shared, key of shared, function, item) -> (result, simulations, failures)"""
+
+CONNECT_S = 10
+"""Seconds in which a Dask scheduler must answer, and have a worker."""
+
+
+@dataclass
+class Executor:
+    """Where work is done.
+
+    jobs   processes on this machine
+    dask   address of a Dask scheduler, whose workers are used instead
+    store  where results are kept; None keeps nothing
+    """
+
+    jobs: int = 1
+    dask: str | None = None
+    store: Store | None = None
+    _client: Any = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.jobs < 1:
+            raise HannesError(f"{self.jobs} jobs: at least one process is needed.")
+
+    @property
+    def serial(self) -> bool:
+        """True if the work is done in this process."""
+        return self.jobs == 1 and self.dask is None
+
+    def run(self, work: Work, shared: Any, key: str, items: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
+        """(k, work(shared, key, *items[k])) for every item, as they are done."""
+        tasks = [delayed(_numbered)(k, code_hash(), work, shared, key, item) for k, item in enumerate(items)]
+        options = {"backend": "dask", "client": self.client()} if self.dask else {"backend": "loky"}
+        with parallel_config(**options):
+            parallel = Parallel(
+                n_jobs=-1 if self.dask else self.jobs,
+                return_as="generator_unordered",
+                batch_size=1,  # type: ignore[arg-type]  # its stubs know "auto" only
+            )
+            try:
+                yield from parallel(tasks)
+            except TerminatedWorkerError as error:
+                raise HannesError(
+                    "A worker process was killed, most likely for want of memory; try fewer --jobs. What was found is "
+                    "kept: the same command goes on from there."
+                ) from error
+
+    def client(self) -> Any:
+        """The connection to the scheduler; raises HannesError where there is none."""
+        if self._client is None:
+            try:
+                from distributed import Client
+            except ImportError as error:
+                raise HannesError(
+                    "--dask needs the libraries of the extra 'cluster': pip install 'hannes_lab[cluster]'."
+                ) from error
+            try:
+                self._client = Client(self.dask, timeout=CONNECT_S, set_as_default=False)
+                self._client.wait_for_workers(1, timeout=CONNECT_S)
+            except (OSError, ValueError) as error:
+                raise HannesError(
+                    f"No Dask scheduler with a worker answers at '{self.dask}' ({error}); give its address as "
+                    "tcp://HOST:8786."
+                ) from error
+        return self._client
+
+    def close(self) -> None:
+        """End the connection to the scheduler."""
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+
+def _numbered(number: int, code: str, work: Work, shared: Any, key: str, item: tuple[Any, ...]) -> Any:
+    if code != code_hash():
+        raise HannesError(
+            "A worker has other sources of hannes or other versions of its libraries than this process: install the "
+            "same on all machines."
+        )
+    return number, work(shared, key, *item)
+
+
+class Held(threading.local):
+    """What a worker built last, one for each of its threads: a plant must not be stepped by two of them."""
+
+    key = ""
+    thing: Any = None
+
+    def get(self, key: str, build: Callable[[], Any]) -> Any:
+        if self.key != key:
+            self.thing = build()
+            self.key = key
+        return self.thing
+
+
+def own(rig: Any) -> Any:
+    """A rig of one's own: workers that are threads of one process are handed the same object."""
+    return copy.deepcopy(rig)
+
+
+@contextmanager
+def interruptible(executor: Executor) -> Iterator[None]:
+    """Ctrl-C ends with one line and exit code 130; what was found so far is kept."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        rest = (
+            "what was found is kept: the same command goes on from there"
+            if executor.store
+            else "nothing is kept"
+        )
+        print(f"\nhannes: interrupted; {rest}", file=sys.stderr)
+        raise typer.Exit(130) from None
+    finally:
+        executor.close()
