@@ -21,10 +21,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from .add import Addition, add_effects, with_provenance
+from .cache import Store
 from .compare import Comparison
 from .compare import compare as compare_model
 from .diagnose import MAX_EFFECTS, Diagnosis, effect_sources
 from .diagnose import diagnose as diagnose_model
+from .executor import Executor, interruptible
 from .prepare import Prepared, load_trials, prepare
 from .rig import load_rig
 
@@ -59,6 +61,14 @@ Greedy = Annotated[
 ]
 Signals = Annotated[list[str] | None, typer.Option("--signal", help="Compare only these signals.")]
 Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Worker processes.")]
+Dask = Annotated[
+    str | None,
+    typer.Option("--dask", help="Work on the Dask cluster whose scheduler is at this address (tcp://HOST:8786)."),
+]
+NoCache = Annotated[
+    bool,
+    typer.Option("--no-cache", help="Neither go on from the results that an earlier run kept, nor keep any."),
+]
 ReportFile = Annotated[Path | None, typer.Option("--report", help="Write a self-contained HTML report here.")]
 
 _JOBS = max(1, os.cpu_count() or 1)
@@ -129,6 +139,10 @@ def _prepared(
         replace(t, options={**t.options, "object": given[t.name]}) if t.name in given else t for t in trials
     ]
     return prepare(trials, Model.load(model), rig=machine, signals=signals, surrogate=True)
+
+
+def _executor(jobs: int, dask: str | None, no_cache: bool) -> Executor:
+    return Executor(jobs, dask, None if no_cache else Store())
 
 
 def _print_json(content: dict[str, Any]) -> None:
@@ -225,6 +239,7 @@ def _show_comparison(result: Comparison) -> None:
         console.print(f"note: {note}", style="dim")
 
 
+@interruptible
 def diagnose(
     bags: Bags,
     model: ModelFile = "nominal",
@@ -238,16 +253,18 @@ def diagnose(
     max_effects: MaxEffects = MAX_EFFECTS,
     greedy: Greedy = False,
     jobs: Jobs = _JOBS,
+    dask: Dask = None,
+    no_cache: NoCache = False,
     report: ReportFile = None,
     json: Json = False,
 ) -> None:
     """Which physical effect does the model lack: nothing, effects of the catalogue, or something unknown?"""
     prepared = _prepared(bags, model, objects, signals, rig)
-    with _Progress(quiet=json) as progress:
+    with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
         found = diagnose_model(
             prepared,
             effect_sources(effects or (), only=only, model=prepared.model),
-            jobs=jobs,
+            executor=executor,
             progress=progress,
             max_effects=max_effects,
             greedy=greedy,
@@ -327,6 +344,7 @@ def _show_falls(console: Console, found: Diagnosis | Addition) -> None:
         console.print("The last columns: error of each signal on held-out conditions.", style="dim")
 
 
+@interruptible
 def add(
     bags: Bags,
     effects: Annotated[list[str], typer.Option("--effect", help="Effect by name, or path.py:Class.")],
@@ -335,13 +353,21 @@ def add(
     objects: Objects = None,
     signals: Signals = None,
     rig: RigFile = None,
+    jobs: Jobs = _JOBS,
+    dask: Dask = None,
+    no_cache: NoCache = False,
     report: ReportFile = None,
     json: Json = False,
 ) -> None:
     """Add effects to the model, fit them, and show the error fall on held-out data."""
     prepared = _prepared(bags, model, objects, signals, rig)
-    with _Progress(quiet=json) as progress:
-        found = add_effects(prepared, effect_sources(only=effects, model=prepared.model), progress=progress)
+    with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
+        found = add_effects(
+            prepared,
+            effect_sources(only=effects, model=prepared.model),
+            executor=executor,
+            progress=progress,
+        )
     path = replace(
         found.model, name=out.stem, provenance={**found.model.provenance, "command": _command()}
     ).save(out)
@@ -416,6 +442,7 @@ def hide(
     typer.echo(f"{len(bags)} bags in {out}, the truth in {truth}")
 
 
+@interruptible
 def report(
     bags: Bags,
     out: Annotated[Path, typer.Option("--out", help="HTML file to write.")] = Path("report.html"),
@@ -427,15 +454,17 @@ def report(
     max_effects: MaxEffects = MAX_EFFECTS,
     greedy: Greedy = False,
     jobs: Jobs = _JOBS,
+    dask: Dask = None,
+    no_cache: NoCache = False,
     json: Json = False,
 ) -> None:
     """Compare, diagnose and add, all on one self-contained HTML page."""
     prepared = _prepared(bags, model, objects, signals, rig)
-    with _Progress(quiet=json) as progress:
+    with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
         found = diagnose_model(
             prepared,
             effect_sources(effects or (), model=prepared.model),
-            jobs=jobs,
+            executor=executor,
             progress=progress,
             max_effects=max_effects,
             greedy=greedy,

@@ -6,12 +6,12 @@ Every item is a pure function of a search and its arguments, so the results are 
 from __future__ import annotations
 
 import copy
+import functools
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ParamSpec
 
 import typer
 from hannes_description.errors import HannesError
@@ -19,6 +19,8 @@ from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from .cache import Store, code_hash
+
+P = ParamSpec("P")
 
 Work = Callable[..., Any]
 """(shared, key of shared, function, item) -> (result, simulations, failures)"""
@@ -87,7 +89,10 @@ class Executor:
                 ) from error
         return self._client
 
-    def close(self) -> None:
+    def __enter__(self) -> Executor:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         """End the connection to the scheduler."""
         if self._client is not None:
             self._client.close()
@@ -121,18 +126,17 @@ def own(rig: Any) -> Any:
     return copy.deepcopy(rig)
 
 
-@contextmanager
-def interruptible(executor: Executor) -> Iterator[None]:
-    """Ctrl-C ends with one line and exit code 130; what was found so far is kept."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        rest = (
-            "what was found is kept: the same command goes on from there"
-            if executor.store
-            else "nothing is kept"
-        )
-        print(f"\nhannes: interrupted; {rest}", file=sys.stderr)
-        raise typer.Exit(130) from None
-    finally:
-        executor.close()
+def interruptible(command: Callable[P, None]) -> Callable[P, None]:
+    """A command that Ctrl-C ends with one line and exit code 130."""
+
+    @functools.wraps(command)
+    def run(*words: P.args, **options: P.kwargs) -> None:
+        try:
+            command(*words, **options)
+        except KeyboardInterrupt:
+            kept = not options.get("no_cache")
+            rest = "what was found is kept: the same command goes on from there" if kept else "nothing is kept"
+            print(f"\nhannes: interrupted; {rest}", file=sys.stderr)
+            raise typer.Exit(130) from None
+
+    return run
