@@ -90,6 +90,13 @@ class Package:
         return {re.split(r"[\s<>=!~\[;]", line)[0].lower() for line in self.lines("options", "install_requires")}
 
     @property
+    def optional(self) -> set[str]:
+        """Names in the extras, lower case."""
+        extras = "options.extras_require"
+        names = self.config[extras] if self.config.has_section(extras) else ()
+        return {re.split(r"[\s<>=!~\[;]", line)[0].lower() for name in names for line in self.lines(extras, name)}
+
+    @property
     def entry_points(self) -> dict[str, str]:
         pairs = (line.split("=", 1) for line in self.lines("options.entry_points", "console_scripts"))
         return {name.strip(): target.strip() for name, target in pairs}
