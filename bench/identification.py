@@ -18,7 +18,7 @@ import itertools
 import json
 import sys
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,8 @@ import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import EffectEntry, Model
 from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.errors import Fixed
+from hannes_lab.fit import fit
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.search import Search
@@ -42,7 +44,7 @@ TUNING_SEED = 1_000
 """First seed of the sets on which thresholds are set (up to 31,100)."""
 
 DETECTABLE = 60.0
-"""Fall of the cost at which an effect counts as detectable: about three times what chance gains."""
+"""Rise of the cost without it at which an effect counts as detectable: about three times what chance gains."""
 
 OUTSIDE = Path(__file__).with_name("outside_effects.py")
 
@@ -128,28 +130,23 @@ def run_case(case: Case) -> dict[str, Any]:
 
 def detection_factors(names: list[str], seed: int = 7) -> dict[str, float]:
     """Strength, in typical values, at which each effect is just detectable: the fall of the cost reaches DETECTABLE
-    after the nuisance parameters have compensated what they can (linearly, on a set without an effect)."""
+    after the nuisance parameters have compensated what they can (refitted, on a set without an effect)."""
     model = Model.load()
     recordings, _ = make_set(model, [], seed=seed)
     prepared: Prepared = prepare([make_trial(r) for r in recordings], model)
     search = Search(prepared.problem, model, prepared.nuisances, effect_sources(only=names))
-    base = search.null()
+    base = search.null().fit
     out = {}
     for name in names:
         kind = load_effect(name)
-        with_effect, coordinates = search.with_effects((kind.name,))
-        here = {c.name: c.value(float(z)) for c, z in zip(base.fit.coordinates, base.fit.z, strict=True)}
-        factor = 1e-3
-        top = highest_factor(name)
+        with_effect, _ = search.with_effects((kind.name,))
+        factor, top = 1e-3, highest_factor(name)
         while factor < top:
-            values = here | {f"{kind.name}.{n}": v for n, v in strength(name, factor)}
-            residual = search.problem.residual(with_effect, values) - base.fit.residual
-            flat = replace(base.fit, z=np.zeros_like(base.fit.z))
-            if search.compensated(residual, flat)[0] >= DETECTABLE:
+            held = Fixed(prepared.problem, {f"{kind.name}.{n}": v for n, v in strength(name, factor)})
+            if fit(held, with_effect, base.coordinates, base.z, evaluations=6).cost >= base.cost + DETECTABLE:
                 break
             factor *= 1.25
         out[name] = min(factor, top)
-        del coordinates
     return out
 
 

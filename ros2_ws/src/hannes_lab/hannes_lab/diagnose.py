@@ -49,6 +49,9 @@ TIE = 12.0
 HOPELESS = 10.0
 """Sets whose cost is so many times that of the best are not followed."""
 
+RIVAL = 2.0
+"""Sets whose cost is at most so many times that of the best are judged beside it with the noise found at it."""
+
 MAX_EFFECTS = 3
 
 WIDE = (4, 3)
@@ -304,28 +307,31 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
     front = [null]
     texts = ("one effect", "two effects", "three effects")
     for size in range(1, max_effects + 1):
+        if size > 1:
+            front = [*front[:1], *choice.search.refitted(front[1:])]
         enough = choice.best.fit.cost <= choice.limits.misfit
-        if enough and size > 1:
-            break
         needed = choice.limits.gain if enough else max(choice.limits.gain, WORTHWHILE * choice.best.fit.cost)
         worth = choice.best.penalised - 0.5 * needed
         round_ = choice.search.extend(front, list(search.sources), texts[size - 1], worth)
         if not round_:
             break
         ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in round_)
-        gain = choice.best.penalised - round_[0].penalised
-        if gain < needed:
+        if choice.best.penalised - round_[0].penalised < needed:
             choice = replace(choice, ranking=ranking)
             break
         new = choice.search.renewed(round_[0])
-        wide = round_[: WIDE[min(size - 1, len(WIDE) - 1)]]
-        front = [new.refit(c) for c in wide if c.penalised <= HOPELESS * round_[0].penalised]
-        front.sort(key=lambda c: c.penalised)
-        best = new.polish(front[0])
+        wide = [
+            c
+            for c in round_[: WIDE[min(size - 1, len(WIDE) - 1)]]
+            if c.penalised <= HOPELESS * round_[0].penalised
+        ]
+        rivals = [c for c in wide if c.penalised <= RIVAL * round_[0].penalised]
+        near = sorted(new.refitted(rivals), key=lambda c: c.penalised)
+        best = new.polish(near[0])
         limits_new = chance(new.problem, best.fit, new.signatures(best))
-        close = tuple(c for c in front[1:] if c.penalised <= best.penalised + TIE)
+        close = tuple(c for c in near[1:] if c.penalised <= best.penalised + TIE)
         choice = _Choice(new, best, limits_new, best.fit.cost <= ADEQUATE * limits_new.misfit, ranking, close)
-        front = [best, *front[1:]]
+        front = [best, *near[1:], *(c for c in wide if c not in rivals)]
     return choice
 
 

@@ -175,14 +175,14 @@ def held_out_condition_errors(
         own = [c for c in coordinates if c.name.endswith(f"@{trial}")]
         values = found.values
         if own:
-            local = _Fixed(problem, {n: v for n, v in values.items() if n not in {c.name for c in own}})
+            local = Fixed(problem, {n: v for n, v in values.items() if n not in {c.name for c in own}})
             values = {**values, **fit(local, model, own, {}, rows=rows, evaluations=6).values}
         errors = signal_errors(features, features.closures(problem.rig, model, values))
         out[condition] = tuple(e for e in errors if e.condition == condition)
     return out
 
 
-class _Fixed(Problem):
+class Fixed(Problem):
     """A problem in which some parameters are held."""
 
     def __init__(self, problem: Problem, held: Mapping[str, float]) -> None:

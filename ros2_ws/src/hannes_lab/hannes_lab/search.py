@@ -342,6 +342,15 @@ class Search:
         free = sum(1 for c in new.coordinates if not c.prior)
         return Candidate(candidate.names, new, new.cost + PENALTY * free)
 
+    def refitted(self, candidates: Sequence[Candidate]) -> list[Candidate]:
+        """Candidates of another problem, each fitted in this one unless it was already."""
+        todo = [c for c in candidates if self.found.get(tuple(sorted(c.names))) is not c]
+        done = iter(self.each(_refit_in_worker, [(c, 8) for c in todo], "noise afresh: refit"))
+        out = [next(done) if c in todo else c for c in candidates]
+        for c in out:
+            self.found[tuple(sorted(c.names))] = c
+        return out
+
     # -- rounds -------------------------------------------------------------------------------------------------
     def extend(
         self, bases: Sequence[Candidate], names: Sequence[str], text: str, worth: float = np.inf

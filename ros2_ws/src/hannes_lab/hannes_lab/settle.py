@@ -53,12 +53,15 @@ def settle(
     renewed = not slopes
     for _ in range(moves):
         new = fit(problem, best.model, best.coordinates, best.z, rows=rows, evaluations=8)
+        least = max(SETTLED, LITTLE * best.cost)
+        if best.cost - new.cost < least:
+            break
         there, new = at_anchor(problem, new, rows)
         gain = best.cost - new.cost
         if gain > 0.0:
             problem, best = there, new
-        if gain < max(SETTLED, LITTLE * best.cost):
-            if gain > 0.0 or renewed:
+        if gain < least:
+            if renewed:
                 break
             problem, renewed = _sloped(problem, best, anew=True), True
     return problem, best
