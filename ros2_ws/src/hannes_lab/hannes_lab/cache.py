@@ -90,6 +90,8 @@ def _parts(thing: Any) -> Iterator[bytes]:
             yield from _parts(key)
             yield from _parts(value)
         yield b"}"
+    elif isinstance(thing, slice):
+        yield repr(thing).encode()
     elif isinstance(thing, (tuple, list)):
         yield b"("
         for one in thing:

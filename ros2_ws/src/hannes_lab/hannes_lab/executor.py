@@ -54,7 +54,8 @@ class Executor:
 
     def run(self, work: Work, shared: Any, key: str, items: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
         """(k, work(shared, key, *items[k])) for every item, as they are done."""
-        tasks = [delayed(_numbered)(k, code_hash(), work, shared, key, item) for k, item in enumerate(items)]
+        code = code_hash() if self.dask else None
+        tasks = [delayed(_numbered)(k, code, work, shared, key, item) for k, item in enumerate(items)]
         options = {"backend": "dask", "client": self.client()} if self.dask else {"backend": "loky"}
         with parallel_config(**options):
             parallel = Parallel(
@@ -99,8 +100,8 @@ class Executor:
             self._client = None
 
 
-def _numbered(number: int, code: str, work: Work, shared: Any, key: str, item: tuple[Any, ...]) -> Any:
-    if code != code_hash():
+def _numbered(number: int, code: str | None, work: Work, shared: Any, key: str, item: tuple[Any, ...]) -> Any:
+    if code is not None and code != code_hash():
         raise HannesError(
             "A worker has other sources of hannes or other versions of its libraries than this process: install the "
             "same on all machines."
@@ -135,7 +136,9 @@ def interruptible(command: Callable[P, None]) -> Callable[P, None]:
             command(*words, **options)
         except KeyboardInterrupt:
             kept = not options.get("no_cache")
-            rest = "what was found is kept: the same command goes on from there" if kept else "nothing is kept"
+            rest = (
+                "what was found is kept: the same command goes on from there" if kept else "nothing is kept"
+            )
             print(f"\nhannes: interrupted; {rest}", file=sys.stderr)
             raise typer.Exit(130) from None
 
