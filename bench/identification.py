@@ -136,6 +136,7 @@ def detection_factors(names: list[str], seed: int = 7) -> dict[str, float]:
     prepared: Prepared = prepare([make_trial(r) for r in recordings], model)
     search = Search(prepared.problem, model, prepared.nuisances, effect_sources(only=names))
     base = search.null().fit
+    known = {c.name: base.jacobian[:, j] for j, c in enumerate(base.coordinates)}
     out = {}
     for name in names:
         kind = load_effect(name)
@@ -143,7 +144,8 @@ def detection_factors(names: list[str], seed: int = 7) -> dict[str, float]:
         factor, top = 1e-3, highest_factor(name)
         while factor < top:
             held = Fixed(prepared.problem, {f"{kind.name}.{n}": v for n, v in strength(name, factor)})
-            if fit(held, with_effect, base.coordinates, base.z, evaluations=6).cost >= base.cost + DETECTABLE:
+            found = fit(held, with_effect, base.coordinates, base.z, known=known, evaluations=8)
+            if found.cost >= base.cost + DETECTABLE:
                 break
             factor *= 1.25
         out[name] = min(factor, top)
