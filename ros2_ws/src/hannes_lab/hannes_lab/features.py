@@ -19,7 +19,7 @@ from hannes_sim.effect import load_effect
 from numpy.typing import NDArray
 
 from .rig import Rig
-from .trials import Trial
+from .trials import Closure, Trial
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -28,6 +28,9 @@ MAX_PHASES = 160
 """Points of the phase grid of one closure at most."""
 
 MIN_CLOSURES_FOR_DRIFT = 4
+
+MOST_SHIFT = 15
+"""Ticks by which a closure may begin earlier or later than where its reference was seen to move."""
 
 
 @dataclass(frozen=True)
@@ -168,12 +171,30 @@ def compact_end(trial: Trial) -> int | None:
     shape = trial.reference[a : a + n]
     span = float(np.ptp(shape)) or 1.0
     for closure in trial.closures[2:]:
-        k = round(closure.start / trial.period)
+        k = _same_place(trial, closure, second)
         other = trial.reference[k : k + n]
         # A fresh reference sample may fall one tick earlier or later from closure to closure.
         if other.size < n or np.mean(np.abs(other - shape)) > 2e-3 * span:
             return None
     return min(trial.reference.size, round(second.stop / trial.period) + 60)
+
+
+def _same_place(trial: Trial, closure: Closure, like: Closure) -> int:
+    """Tick at which the reference of a closure begins to be that of another one.
+
+    Where the logged reference is coarse, the closure's start is known to one of its steps; the whole curve says more.
+    """
+    a, k = round(like.start / trial.period), round(closure.start / trial.period)
+    n = round((like.stop - like.start) / trial.period)
+    shape = trial.reference[a : a + n]
+
+    def apart(at: int) -> float:
+        other = trial.reference[at : at + n]
+        return float(np.mean(np.abs(other - shape[: other.size]))) if at >= 0 and other.size else np.inf
+
+    if apart(k) == 0.0:
+        return k
+    return min(range(k - MOST_SHIFT, k + MOST_SHIFT + 1), key=lambda at: (apart(at), abs(at - k)))
 
 
 def _block(
@@ -205,7 +226,11 @@ def _block(
         measured.append(values[left] * (1.0 - weight) + values[right] * weight)
         full.append((sample_tick[left], sample_tick[right], weight))
         if base is not None and limit is not None:
-            shift = 0 if closure is trial.closures[0] else round((base.start - closure.start) / trial.period)
+            shift = (
+                0
+                if closure is trial.closures[0]
+                else round(base.start / trial.period) - _same_place(trial, closure, base)
+            )
             compact.append(
                 (
                     np.clip(sample_tick[left] + shift, 0, limit - 1),

@@ -19,6 +19,7 @@ from hannes_sim.plant import Plant
 from hannes_sim.rollout import Rollout
 from numpy.typing import NDArray
 
+from .features import Block
 from .rig import Nuisance, PlantRig, make_controller
 from .trials import Trial
 
@@ -29,11 +30,16 @@ Array = NDArray[np.float64]
 _PER_OBJECT = ("object.stiffness", "object.position")
 
 _UNKNOWN_OBJECT_SD = {"object.stiffness": 1.5, "object.position": 2.0}
-"""Widths of the priors of an object of which only the kind is known (stiffness: of the logarithm; place: rad)."""
+_UNKNOWN_DAMPING_SD = 1.5
+"""Widths of the priors of an object of which only the kind is known (stiffness, damping: of the logarithm; place: rad)."""
 
 _UNKNOWN_GAINS = {"control.kp": 0.2, "control.damping": 0.5, "control.current_kp": 1.2, "control.current_ki": 1.2}
 """Gains of a controller that nobody described, with the widths of their priors (of the logarithm): the outer loop shows
 in the static error; of the inner one the thesis gives the order of magnitude."""
+
+_WIRE = "wire.stiffness"
+_UNKNOWN_WIRE_SD = 0.5
+"""Width of its prior (of the logarithm): nobody measured it, and on an unknown object it counts with the object's."""
 
 REFERENCE_DELAY = "log.reference_delay"
 REFERENCE_DELAY_SD = 0.02
@@ -42,7 +48,28 @@ after or before it was filtered."""
 
 CURRENT_WINDOW = "log.current_window"
 
-UNKNOWN_DISCREPANCY = 0.005
+_RATE_OVER = 0.01
+_SMOOTHED = 0.03
+"""s; a reference that comes by messages has a rate only over one or several of them."""
+
+OWN_ERROR: Mapping[str, float] = {"encoder_position": 0.003}
+OWN_ERROR_DRIVE = 0.02
+"""Of a signal's span: how far the form of the model may be from that of a hand that is not this simulator's.  The loop holds
+the position; what the model does not know shows in what drives it."""
+
+AT_REST = 10.0
+"""How many times larger that is once the reference is back at rest: the hand lies against its open stop on a slack wire, of
+which nothing is known."""
+
+REFERENCE_LEAD = "log.reference_lead"
+LEAD_SEEN = 0.02
+"""s; a reference that seems so early is one whose rate the controller sees too (a derivative of the error)."""
+
+_RATE_OVER = 0.01
+_SMOOTHED = 0.03
+"""s; a reference that comes by messages has a rate only over one or several of them."""
+
+UNKNOWN_DISCREPANCY = 0.01
 """Of a signal's span: how far the form of the model may be from a hand that is not this simulator's."""
 
 
@@ -101,8 +128,6 @@ class HandRig(PlantRig):
 
     def __init__(self, trials: Sequence[Trial]) -> None:
         super().__init__(trials)
-        if not all(is_described(trial) for trial in self.trials):
-            self.discrepancy = UNKNOWN_DISCREPANCY
         self._sensors = {trial.name: sensors_of(trial) for trial in self.trials}
 
     @classmethod
@@ -124,6 +149,11 @@ class HandRig(PlantRig):
                     plant, _, _ = self._plant(model.without_effects(), trial)
                     width = sd if is_described(trial) else _UNKNOWN_OBJECT_SD[name]
                     out.append(Nuisance(f"{name}@{trial.name}", plant.get(name), width, relative, scatter))
+                    damping = "object.damping"
+                    if name == "object.stiffness" and not is_described(trial) and damping in plant.names:
+                        out.append(
+                            Nuisance(f"{damping}@{trial.name}", plant.get(damping), _UNKNOWN_DAMPING_SD, True)
+                        )
             elif name == "encoder.zero":
                 out += [
                     Nuisance(f"{name}@{trial.name}", 0.0, sd, False, scatter, "rad") for trial in self.trials
@@ -136,21 +166,48 @@ class HandRig(PlantRig):
         """What is unknown of controller and logger where a recording does not describe them."""
         strange = [trial for trial in self.trials if not is_described(trial)]
         out: list[Nuisance] = []
+        delay = lead = 0.0
         if strange and model.controller == "double_pid":
+            means = {name: model.parameters.value(name) for name in _UNKNOWN_GAINS}
+            seen = outer_loop(strange)
+            if seen is not None:
+                kp, damping, delay = seen
+                if delay < -LEAD_SEEN:
+                    delay, lead = 0.0, -delay
+                    out.append(Nuisance(REFERENCE_LEAD, lead, REFERENCE_DELAY_SD, False, unit="s"))
+                means |= {"control.kp": kp, "control.damping": damping}
             out += [
-                Nuisance(name, model.parameters.value(name), sd, True, unit=model.parameters[name].unit)
+                Nuisance(name, means[name], sd, True, unit=model.parameters[name].unit)
                 for name, sd in _UNKNOWN_GAINS.items()
-                if model.parameters.value(name) > 0.0
+                if means[name] > 0.0
             ]
+        if strange and model.parameters.value(_WIRE) > 0.0:
+            unit = model.parameters[_WIRE].unit
+            out.append(Nuisance(_WIRE, model.parameters.value(_WIRE), _UNKNOWN_WIRE_SD, True, unit=unit))
         logged = [t.signals["motor_current"][0] for t in strange if "motor_current" in t.signals]
         if logged:
             step = float(np.median(np.diff(logged[0])))
             out.append(Nuisance(CURRENT_WINDOW, 0.5 * step, 1.0, True, unit="s"))
         out += [
-            Nuisance(f"{REFERENCE_DELAY}@{trial.name}", 0.0, REFERENCE_DELAY_SD, False, unit="s")
+            Nuisance(f"{REFERENCE_DELAY}@{trial.name}", delay, REFERENCE_DELAY_SD, False, unit="s")
             for trial in strange
         ]
         return out
+
+    def own_error(self, block: Block) -> Array:
+        """See Rig: none for a recording that this simulator's chain describes."""
+        trial = self.trials[block.trial]
+        if is_described(trial):
+            return np.zeros(block.phase.size)
+        span = float(np.ptp(block.measured)) or 1.0
+        sd = np.full(block.phase.size, OWN_ERROR.get(block.signal, OWN_ERROR_DRIVE) * span)
+        closure = trial.of(block.condition)[0]
+        ticks = np.arange(trial.reference.size) * trial.period
+        reference = np.interp(closure.start + block.phase, ticks, trial.reference)
+        away = np.abs(reference - reference[-1]) > 0.02 * float(np.ptp(reference))
+        if away.any():
+            sd[int(np.flatnonzero(away)[-1]) + 1 :] *= AT_REST
+        return sd
 
     def plant(self, model: Model, trial: Trial) -> Plant:
         """The plant with the trial's object, encoder quantiser off."""
@@ -162,18 +219,20 @@ class HandRig(PlantRig):
         """The rollout itself; gains of the controller and the clock of the reference may be among the values."""
         of_plant: dict[str, float] = {}
         gains: dict[str, float] = {}
-        delay = 0.0
+        delay = lead = 0.0
         for name, value in values.items():
             if name.startswith("control."):
                 gains[name.removeprefix("control.")] = value
             elif name == f"{REFERENCE_DELAY}@{trial.name}":
                 delay = value
+            elif name == REFERENCE_LEAD and not is_described(trial):
+                lead = value
             elif not name.startswith("log."):
                 of_plant[name] = value
         _, controller, _ = self._plant(model, trial)
         if isinstance(controller, DoublePID):
             controller.parameters[:] = replace(controller.settings, **gains).to_array()
-        return super().run(model, of_plant, trial, _delayed(reference, delay, trial))
+        return super().run(model, of_plant, trial, _moved(reference, delay, lead, trial))
 
     def simulate(
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
@@ -204,13 +263,51 @@ class HandRig(PlantRig):
         }
 
 
-def _delayed(reference: Array, delay: float, trial: Trial) -> Array:
-    """The reference later by `delay` [s]; what comes after a cut reference is that of the trial."""
-    if delay == 0.0:
+def outer_loop(trials: Sequence[Trial]) -> tuple[float, float, float] | None:
+    """Gain [A/rad], damping [A.s/rad] and delay of the reference [s] of the outer loop, as the recordings show them.
+
+    While the inner loop keeps up, i = kp (r - tau r' - q) - kd q', whatever the motor drives; so r - q is linear in i, q'
+    and r'.  A negative tau is a controller that sees the reference's rate too (a derivative of the error).  None where
+    the recordings do not show it.
+    """
+    rows = []
+    for trial in trials:
+        if not {"motor_current", "encoder_position"} <= set(trial.signals):
+            continue
+        time, current = trial.signals["motor_current"]
+        signed = float(current.min()) < -0.05 * float(current.max())
+        ticks = np.arange(trial.reference.size) * trial.period
+        width = max(1, round(_SMOOTHED / trial.period))
+        reference = np.convolve(trial.reference, np.ones(width) / width, mode="same")
+        rate = np.gradient(reference, trial.period)
+        step = float(np.median(np.diff(time)))
+        for closure in trial.closures:
+            at = np.arange(closure.start, closure.stop, step)
+            position = np.interp(at, *trial.signals["encoder_position"])
+            if at.size < 8:
+                continue
+            velocity = np.gradient(position, at)
+            r, dr = np.interp(at, ticks, reference), np.interp(at, ticks, rate)
+            moving = (np.abs(velocity) if signed else velocity) > 0.1 * velocity.max()
+            rows.append(np.column_stack([np.interp(at, time, current), velocity, dr, r - position])[moving])
+    table = np.concatenate(rows) if rows else np.zeros((0, 4))
+    if table.shape[0] < 30:
+        return None
+    (per_ampere, lag, delay), *_ = np.linalg.lstsq(table[:, :3], table[:, 3], rcond=None)
+    if per_ampere <= 0.0 or lag <= 0.0 or abs(delay) > 0.2:
+        return None
+    return float(1.0 / per_ampere), float(lag / per_ampere), float(delay)
+
+
+def _moved(reference: Array, delay: float, lead: float, trial: Trial) -> Array:
+    """The reference later by `delay` [s] and with `lead` [s] times its rate; after a cut one comes that of the trial."""
+    if delay == 0.0 and lead == 0.0:
         return reference
     n = reference.size
     whole = trial.reference if np.array_equal(trial.reference[:n], reference) else reference
     ticks = np.arange(whole.size, dtype=np.float64)
+    if lead != 0.0:
+        whole = whole + lead * np.gradient(_moving_mean(whole, _RATE_OVER / trial.period), trial.period)
     return np.interp(ticks[:n] - delay / trial.period, ticks, whole)
 
 

@@ -7,8 +7,8 @@ encoder zero ...), whose sensitivities are known, so that 13 closures are enough
     C_c = (diag(v) + J_c S J_c^T) / n        per condition c; v smoothed sample variance, S = diag(scatter variances)
 
 Where the model's form is not exactly that of the machine (a real hand, another simulator) its own error is added, which
-does not average out over the closures: a smooth random curve of `rig.discrepancy` times the signal's span (Kennedy,
-O'Hagan 2001, with a fixed width).
+does not average out over the closures: a smooth random curve of the width `rig.own_error` (Kennedy, O'Hagan 2001, with a
+fixed width).
 
 Whitened residual: L_c^{-1} (measured - predicted), C_c = L_c L_c^T.
 """
@@ -144,7 +144,7 @@ class Problem:
 
     whitener    per condition, rows of the features and the Cholesky factor of their covariance
     deviations  per block (n, p), scatter of the closures: what the model does not predict of their differences
-    discrepancy  rows of the features and the Cholesky factor of the covariance of the model's own error, where it has one
+    discrepancy  rows of the features and the Cholesky factor of the covariance of the model's own error, if it has one
     """
 
     rig: Rig
@@ -220,10 +220,15 @@ def build_problem(
     for nuisance in scatter_names:
         c = nuisance_coordinate(nuisance)
         here = c.z(values.get(nuisance.name, nuisance.mean))
-        moved = features.closures(rig, model, {**values, nuisance.name: c.value(here + c.step)})
-        # sensitivity to one standard deviation of the closure-to-closure scatter
-        factor = nuisance.closure_sd / nuisance.sd / c.step
-        columns.append([(m - b).mean(axis=0) * factor for m, b in zip(moved, base, strict=True)])
+        for step in (c.step, -c.step):
+            try:
+                moved = features.closures(rig, model, {**values, nuisance.name: c.value(here + step)})
+            except PlantDiverged:
+                continue
+            # sensitivity to one standard deviation of the closure-to-closure scatter
+            factor = nuisance.closure_sd / nuisance.sd / step
+            columns.append([(m - b).mean(axis=0) * factor for m, b in zip(moved, base, strict=True)])
+            break
 
     whitener = []
     discrepancy = []
@@ -248,26 +253,27 @@ def build_problem(
             if not rows.size:
                 continue
             covariance = single / count
-            if rig.discrepancy > 0.0 and part[0][1] == 0:
-                own_error = _own_error([features.blocks[k] for k in own], rig.discrepancy)
-                covariance = covariance + own_error
-                discrepancy.append((rows, np.linalg.cholesky(own_error)))
+            if part[0][1] == 0:
+                own_error = _own_error([features.blocks[k] for k in own], rig)
+                if own_error.any():
+                    covariance = covariance + own_error
+                    discrepancy.append((rows, np.linalg.cholesky(own_error)))
             whitener.append((rows, np.linalg.cholesky(covariance)))
     return Problem(
         rig, features, tuple(whitener), tuple(deviations), counts or Counts(), tuple(discrepancy)
     )
 
 
-def _own_error(blocks: Sequence[Block], relative: float) -> Array:
-    """Covariance of the model's own error over the phases of these blocks, one after another."""
+def _own_error(blocks: Sequence[Block], rig: Rig) -> Array:
+    """Covariance of the model's own error over the phases of these blocks, one after another; zero if it has none."""
     out = np.zeros((sum(b.phase.size for b in blocks),) * 2)
     at = 0
     for block in blocks:
+        sd = rig.own_error(block)
         length = DISCREPANCY_LENGTH * float(block.phase[-1] - block.phase[0])
         apart = np.abs(block.phase[:, None] - block.phase[None, :]) / length
-        sd = relative * (float(np.ptp(block.measured)) or 1.0)
         own = slice(at, at + block.phase.size)
-        out[own, own] = sd**2 * np.exp(-apart)
+        out[own, own] = sd[:, None] * np.exp(-apart) * sd
         at += block.phase.size
     return out
 

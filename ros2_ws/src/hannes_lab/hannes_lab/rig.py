@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from hannes_control.double_pid import DoublePID
@@ -27,6 +27,9 @@ from hannes_sim.rollout import Controller, Rollout, rollout
 from numpy.typing import NDArray
 
 from .trials import Trial
+
+if TYPE_CHECKING:
+    from .features import Block
 
 Array = NDArray[np.float64]
 
@@ -74,8 +77,6 @@ class Rig(Protocol):
     trials    what was recorded
     floor     smallest standard deviation of a sample, relative to the span of its signal, that the simulation of a
               logged reference can promise
-    discrepancy  how far the best parameters may leave the model from the machine, relative to the span of a signal: no
-              model has exactly the machine's form.  0: a difference of any size counts
     points    points of the phase grid of one closure at most
     without   effects that have no meaning on this machine, with the reason
     drive_signals  signals that tell force or torque of the drive
@@ -88,7 +89,6 @@ class Rig(Protocol):
 
     trials: tuple[Trial, ...]
     floor: float
-    discrepancy: float
     points: int
     drive_signals: tuple[str, ...]
     pooled: bool
@@ -99,6 +99,12 @@ class Rig(Protocol):
 
     def nuisances(self, model: Model) -> Sequence[Nuisance]:
         """The uncertain nominal parameters with their priors."""
+
+    def own_error(self, block: Block) -> Array:
+        """Standard deviation (p,) of the model's own error over the phases of a block, in the signal's unit.
+
+        No model has exactly the machine's form: so far the best parameters may leave it.  0: any difference counts.
+        """
 
     def effect(self, kind: EffectType) -> EffectType:
         """An effect of the catalogue with typical values, bounds and units for this machine."""
@@ -126,7 +132,7 @@ class PlantRig:
                  from REFERENCE_SIZES; effects are scaled by them
     linear       True where position is in m and the drive gives N: units are named so
     without      effects that have no meaning here, with the reason
-    floor, discrepancy, points, drive_signals, pooled, phases, figures, experiments  see Rig
+    floor, points, drive_signals, pooled, phases, figures, experiments  see Rig
 
     Plants are built once per (model structure, trial) and then only re-parametrised.
     """
@@ -137,7 +143,6 @@ class PlantRig:
     linear: ClassVar[bool] = False
     without: Mapping[str, str] = {}
     floor: float = 2e-4  # replay of a reference logged by messages, and a plant of finite step
-    discrepancy: float = 0.0
     points: int = 160
     drive_signals: tuple[str, ...] = ("motor_current", "motor_effort")
     pooled: bool = False
@@ -179,6 +184,10 @@ class PlantRig:
             ) from error
         unit = model.parameters[name].unit
         return Nuisance(name, model.parameters.value(name), sd, relative, scatter, unit)
+
+    def own_error(self, block: Block) -> Array:
+        """See Rig."""
+        return np.zeros(block.phase.size)
 
     def effect(self, kind: EffectType) -> EffectType:
         """See Rig."""

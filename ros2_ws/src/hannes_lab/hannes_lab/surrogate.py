@@ -52,7 +52,6 @@ class AnchoredRig:
         self.exact = exact
         self.trials = exact.trials
         self.floor, self.points, self.pooled = exact.floor, exact.points, exact.pooled
-        self.discrepancy = exact.discrepancy
         self.drive_signals, self.without = exact.drive_signals, exact.without
         self.phases, self.figures, self.experiments = exact.phases, exact.figures, exact.experiments
         self._model, self._values = model, dict(values)
@@ -86,6 +85,10 @@ class AnchoredRig:
     def nuisances(self, model: Model) -> Sequence[Nuisance]:
         """See Rig."""
         return self.exact.nuisances(model)
+
+    def own_error(self, block: Block) -> Array:
+        """See Rig."""
+        return self.exact.own_error(block)
 
     def effect(self, kind: EffectType) -> EffectType:
         """See Rig."""

@@ -32,8 +32,9 @@ UNITS = {
 """Units of the signals; a trial may name others."""
 
 ZERO_ORDER_HOLD_RATE = 90.0
-"""Hz; a reference logged at least this fast is what the controller received, message by message; a slower log has
-gaps that are filled by a smooth curve."""
+STRANGE_HOLD_RATE = 225.0
+"""Hz; a reference logged at least this fast is what the controller received, message by message; a slower log has gaps that
+are filled by a smooth curve.  The second is for recordings that do not say how they were logged."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,9 @@ class Trial:
         return replace(self, closures=tuple(closures))
 
 
-def reference_on_grid(time: Array, values: Array, period: float, duration: float) -> tuple[Array, str | None]:
+def reference_on_grid(
+    time: Array, values: Array, period: float, duration: float, hold_rate: float = ZERO_ORDER_HOLD_RATE
+) -> tuple[Array, str | None]:
     """The reference [n] on the control grid, and a note where it had to be guessed between samples.
 
     Fast logs are held from message to message, as the controller does.  Slow logs are interpolated by a monotone cubic;
@@ -99,7 +102,7 @@ def reference_on_grid(time: Array, values: Array, period: float, duration: float
     """
     grid = np.arange(max(2, math.floor(duration / period + 1e-6) + 1)) * period
     step = float(np.median(np.diff(time))) if time.size > 1 else period
-    if time.size < 4 or 1.0 / step >= ZERO_ORDER_HOLD_RATE:
+    if time.size < 4 or 1.0 / step >= hold_rate:
         index = np.clip(np.searchsorted(time, grid + 1e-7, side="right") - 1, 0, time.size - 1)
         return values[index], None
     from scipy.interpolate import PchipInterpolator
@@ -188,10 +191,11 @@ def find_moves(reference: Array, period: float, *, slow: float = 0.1) -> list[tu
 
 
 def group_closures(
-    reference: Array, period: float, spans: Iterable[tuple[float, float]], name: str
+    reference: Array, period: float, spans: Iterable[tuple[float, float]], name: str, step: float = 0.0
 ) -> list[Closure]:
     """Closures whose reference is the same (within 3 % of its span, and 3 % of its length) share a condition.
 
+    step  s between two samples of the logged reference: closures may begin anywhere between two
     Cut-off closures (less than 80 % of the usual length of their condition) are dropped.
     """
     kinds: list[tuple[Array, float]] = []
@@ -203,8 +207,10 @@ def group_closures(
         span = float(np.ptp(shape)) or 1.0
         for index, (other, length) in enumerate(kinds):
             n = min(shape.size, other.size)
+            slope = _change(shape, step / period)
             alike = (
-                n >= 0.3 * other.size and float(np.max(np.abs(shape[:n] - other[:n]))) <= 0.03 * span + 1e-9
+                n >= 0.3 * other.size
+                and float(np.max(np.abs(shape[:n] - other[:n]))) <= 0.03 * span + slope + 1e-9
             )
             longer = max(shape.size, other.size) * period
             if alike and (abs((stop - start) - length) <= 0.03 * length or n * period < longer):
@@ -220,6 +226,12 @@ def group_closures(
         label = name if len(kinds) == 1 else f"{name}.{index + 1}"
         out += [Closure(a, min(b, a + usual), label) for a, b in own if b - a >= 0.8 * usual]
     return sorted(out, key=lambda closure: closure.start)
+
+
+def _change(shape: Array, ticks: float) -> float:
+    """Greatest change of a reference over this many ticks (rounded up)."""
+    lag = math.ceil(ticks)
+    return float(np.max(np.abs(shape[lag:] - shape[:-lag]))) if 0 < lag < shape.size else 0.0
 
 
 def make_trial(
@@ -246,7 +258,11 @@ def make_trial(
     origin = math.floor(origin / period + 1e-6) * period
     duration = max(float(recording[s].time[-1]) for s in ("reference_position", *present)) - origin
     reference, note = reference_on_grid(
-        channel.time - origin, np.asarray(channel.values, dtype=float), period, duration
+        channel.time - origin,
+        np.asarray(channel.values, dtype=float),
+        period,
+        duration,
+        ZERO_ORDER_HOLD_RATE if "sensors" in meta else STRANGE_HOLD_RATE,
     )
     if note:
         notes.append(note)
@@ -258,7 +274,7 @@ def make_trial(
     end = min(float(t[-1]) for t, _ in samples.values())
     spans = find_closures(reference, period)
     whole = [(a, min(b, end)) for a, b in spans if a >= begin - 0.1 and b > a]
-    closures = group_closures(reference, period, whole, name)
+    closures = group_closures(reference, period, whole, name, channel.period)
     if spans and len(closures) < len(spans):
         notes.append(f"{len(spans) - len(closures)} of {len(spans)} closures are cut off and left out")
     options = {key: meta[key] for key in ("object", "sensors", "pose", "encoder_session") if key in meta}

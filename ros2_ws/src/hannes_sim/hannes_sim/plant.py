@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from hannes_description.errors import HannesError
 from numpy.typing import NDArray
 
 from .ports import (
@@ -23,7 +24,7 @@ DEFAULT_DT = 0.25e-3
 """s; the step for use. Identification and convergence checks halve it."""
 
 
-class PlantDiverged(RuntimeError):
+class PlantDiverged(HannesError, RuntimeError):
     """The simulation became unstable or non-finite; the message names the time and the coordinate."""
 
 
