@@ -126,5 +126,46 @@ def test_a_hand_is_recovered_from_its_recordings(tmp_path: Path) -> None:
     assert found.model.provenance["bags"] and found.model.provenance["free"] == NAMES
     path = found.model.save(tmp_path / "my_hand.yaml")
     assert Model.load(path).sha256 == found.model.sha256
-    with pytest.raises(HannesError, match=r"control\.kp"):
-        calibrate(prepared, ["control.kp"])
+    with pytest.raises(HannesError, match=r"Did you mean friction\.coulomb"):
+        calibrate(prepared, ["friction.colomb"])
+    with pytest.raises(HannesError, match=r"control\.saver_time"):
+        calibrate(prepared, ["control.saver_time"])
+
+
+def test_intervals_hold_the_tolerances_of_what_is_not_free() -> None:
+    """Hands drawn from the population; `bench/coverage.py` does the same with more of them."""
+    names = ["friction.coulomb", "hand.preload", "motor.kt"]
+    inside, exact, count = 0, 0, 0
+    for seed in range(1010, 1013):
+        recordings, truth = make_set(NOMINAL, [], seed=seed, closures=4)
+        prepared = prepare(unique_names([make_trial(r) for r in recordings]), NOMINAL)
+        for p in calibrate(prepared, names, starts=1).parameters:
+            true = NOMINAL.parameters.value(p.name) * float(truth.parameters[p.name].split()[1])
+            inside += p.low <= true <= p.high
+            alone = 0.5 * np.log(p.high / p.low) * np.sqrt(max(0.0, 1.0 - p.held_share))
+            exact += abs(np.log(p.value / true)) <= alone
+            count += 1
+    assert inside >= 0.8 * count
+    assert exact < inside
+
+
+def test_a_held_parameter_that_is_off_is_named() -> None:
+    hand = NOMINAL.with_values({"motor.kt": 0.92 * NOMINAL.parameters.value("motor.kt")})
+    recordings, _ = make_set(hand, [], seed=1, closures=4, spread=0.0)
+    prepared = prepare(unique_names([make_trial(r) for r in recordings]), NOMINAL)
+    found = calibrate(prepared, ["hand.preload"], starts=1)
+    assert any("motor.kt" in text and "free it too" in text for text in found.warnings)
+    better = calibrate(prepared, ["hand.preload", "motor.kt"], starts=1)
+    assert not any("free it too" in text for text in better.warnings)
+    assert better.errors["after"] < 0.3 * found.errors["after"]
+
+
+def test_gains_may_be_free_and_that_they_are_marked_as_fixed_is_said(tmp_path: Path) -> None:
+    hand = NOMINAL.with_values({"control.kp": 0.46})
+    recordings, _ = make_set(hand, [], seed=1, closures=3, conditions=("slow", "fast"), spread=0.0)
+    prepared = prepare(unique_names([make_trial(r) for r in recordings]), NOMINAL)
+    found = calibrate(prepared, ["control.kp"], starts=1, cache=tmp_path)
+    (kp,) = found.parameters
+    assert kp.value == pytest.approx(0.46, rel=0.02)
+    assert found.model.parameters.value("control.kp") == kp.value
+    assert any("marked as fixed" in text for text in found.warnings)

@@ -3,8 +3,15 @@
     z* = argmin |r(z)|^2 + |z|^2        r: whitened residual (Problem or TargetProblem); z: standard deviations
                                         from the prior's mean, inside the bounds
 
-from several starts; intervals from the curvature at the best.  A parameter whose posterior is hardly narrower than its
-prior is not identified by the data; of two whose effects on the data are nearly proportional only one combination is.
+from several starts; intervals from the curvature at the best.  What is held is not exact: a held parameter that is one
+standard deviation of its tolerance away moves the estimate by a column of
+
+    G = (J^T J + 1)^-1 J^T H        J, H: derivatives of the residual by the free and by the held parameters
+
+so that the covariance of the estimate is that of the fit plus G G^T.  A parameter whose interval is hardly narrower
+than its prior is not identified by the data; of two whose effects on the data are nearly proportional only one
+combination is.
+
 Every simulation's residual is kept in a folder under the hash of all that determines it, so that a stopped calibration
 goes on where it was.
 """
@@ -17,6 +24,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from functools import cache as cache_once
 from importlib.util import find_spec
 from pathlib import Path
@@ -31,8 +39,9 @@ from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
 from .errors import held_out_closures, overall, signal_errors
+from .executor import interruptible
 from .features import data_used
-from .fit import Fit, fit
+from .fit import Fit, finite_differences, fit
 from .hand import HandRig
 from .prepare import Prepared
 from .problem import FAILED, Coordinate, Problem, build_problem, nuisance_coordinate
@@ -52,8 +61,22 @@ UNIDENTIFIED = 0.7
 CONFOUNDED = 0.95
 """Correlation of two parameters' posterior, priors aside, above which they cannot be told apart."""
 
+LARGE_MISFIT = 3.0
+"""Multiple of the repeatability above which the model, whatever its parameters, does not explain the recordings."""
+
+EXPLAINS = 0.3
+"""Share of the misfit that a held parameter must explain to be named."""
+
+ON_BOUND = 0.01
+"""Of the distance between the bounds (on the parameter's own scale): nearer than this is on the bound."""
+
+GAINS = tuple(f"control.{name}" for name in ("kp", "damping", "current_kp", "current_ki"))
+"""Gains of the double PID that may be free: a rollout can change them."""
+
 LAB_SOURCES = (
     "features.py",
+    "rig.py",
+    "surrogate.py",
     "trials.py",
     "problem.py",
     "hand.py",
@@ -206,11 +229,12 @@ def default_cache() -> Path:
 class Identified:
     """One calibrated parameter.
 
-    low, high   95 % interval
-    narrowing   posterior over prior standard deviation
+    low, high   95 % interval, with the tolerances of what is held
+    narrowing   standard deviation of the estimate over that of the prior
     identified  the data narrowed it and nothing else can take its place
     confounded  the parameter that it cannot be told apart from, with their correlation
     at_bound    the best value lies on a bound
+    held        the held parameter whose tolerance widens the interval most, with its share of the variance
     """
 
     name: str
@@ -223,6 +247,8 @@ class Identified:
     confounded: str | None = None
     correlation: float = 0.0
     at_bound: bool = False
+    held: str | None = None
+    held_share: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         return self.__dict__.copy()
@@ -329,15 +355,62 @@ def search(
     return sorted(found, key=lambda f: f.cost)
 
 
-def identify(best: Fit, free: Sequence[str]) -> tuple[Identified, ...]:
+def held_coordinates(model: Model, free: Sequence[str]) -> list[Coordinate]:
+    """The parameters of the model that the population's tolerances speak of and that are not free."""
+    out = []
+    for name, entry in read_yaml(data_path("parameters", "population.yaml"), "population file").items():
+        if name in free or name not in model.parameters or model.parameters.value(name) <= 0.0:
+            continue
+        out.append(
+            Coordinate(
+                name,
+                model.parameters.value(name),
+                float(entry["hand_sd"]),
+                entry["unit"] == "1",
+                -math.inf,
+                math.inf,
+                True,
+                0.5,
+                model.parameters[name].unit,
+            )
+        )
+    return out
+
+
+def sensitivities(problem: Residuals, best: Fit, held: Sequence[Coordinate]) -> Array:
+    """Derivatives (n, len(held)) of the residual at the best point by held parameters, in their standard deviations."""
+    k = len(best.coordinates)
+    return finite_differences(
+        cast(Problem, problem),
+        best.model,
+        [*best.coordinates, *held],
+        np.concatenate([best.z, np.zeros(len(held))]),
+        best.residual,
+        range(k, k + len(held)),
+    )
+
+
+def identify(
+    best: Fit, free: Sequence[str], held: Sequence[Coordinate] = (), by_held: Array | None = None
+) -> tuple[Identified, ...]:
     """Intervals of the free parameters and what the data cannot tell, from the curvature at the best point.
 
+    held, by_held  parameters that were held, and the residual's derivatives (n, len(held)) by them (`sensitivities`)
+
     The covariance of the residual is taken as 1 or, where there are more data than parameters and the misfit is
-    larger than that, inflated to it.
+    larger than that and than what the held parameters' tolerances explain, inflated to it.
     """
     n, k = best.residual.size, len(best.coordinates)
-    inflate = max(1.0, best.misfit / (n - k)) if n > k else 1.0
-    posterior = best.covariance(inflate)
+    moved = np.zeros((n, 0)) if by_held is None else by_held
+    along = moved.T @ best.residual
+    # r^T (1 + H H^T)^-1 r by Woodbury's formula
+    explained = (
+        along @ np.linalg.solve(np.eye(moved.shape[1]) + moved.T @ moved, along) if along.size else 0.0
+    )
+    inflate = max(1.0, (best.misfit - float(explained)) / (n - k)) if n > k else 1.0
+    fitted = best.covariance(inflate)
+    shift = best.covariance() @ best.jacobian.T @ moved
+    posterior = fitted + shift @ shift.T
     information = best.jacobian.T @ best.jacobian
     # Without priors; a hair of regularisation keeps what is not seen at all finite.
     alone = np.linalg.pinv(information + 1e-9 * np.eye(k) * max(1.0, float(np.trace(information))))
@@ -354,8 +427,10 @@ def identify(best: Fit, free: Sequence[str]) -> tuple[Identified, ...]:
         other = int(np.argmax(others)) if k > 1 else -1
         partner = best.coordinates[other].name if other >= 0 and others[other] > CONFOUNDED else None
         lower, upper = c.bounds
-        bound = bool(min(abs(z - lower), abs(upper - z)) < 1e-3)
+        near = ON_BOUND * min(upper - lower, 1.0)
+        bound = bool(min(abs(z - lower), abs(upper - z)) < near)
         seen = sd <= UNIDENTIFIED
+        widest = int(np.argmax(np.abs(shift[j]))) if shift.shape[1] else -1
         out.append(
             Identified(
                 c.name,
@@ -368,6 +443,8 @@ def identify(best: Fit, free: Sequence[str]) -> tuple[Identified, ...]:
                 partner,
                 float(correlation[j, other]) if other >= 0 else 0.0,
                 bound,
+                held[widest].name if widest >= 0 else None,
+                float(shift[j, widest] ** 2 / max(posterior[j, j], 1e-300)) if widest >= 0 else 0.0,
             )
         )
     return tuple(out)
@@ -378,10 +455,16 @@ def warnings_of(parameters: Sequence[Identified], free_count: int, data_count: i
     out = []
     for p in parameters:
         if p.narrowing > UNIDENTIFIED:
+            by_held = p.held_share > 0.5
             out.append(
                 f"{p.name} is not identified by these data: its interval is {100 * p.narrowing:.0f} % of the "
-                "prior's, which decides much of its value"
-                + (f" (confounded with {p.confounded})." if p.confounded else ".")
+                "prior's"
+                + (
+                    f", most of it from the tolerance of {p.held}, which is held: measure {p.held}, or free it."
+                    if by_held
+                    else ", which decides much of its value"
+                    + (f" (confounded with {p.confounded})." if p.confounded else ".")
+                )
             )
         elif p.confounded:
             out.append(
@@ -450,7 +533,9 @@ def calibrate_targets(
         announce=announce,
     )
     free = [c.name for c in coordinates]
-    parameters = identify(found[0], free)
+    remembered.text = "tolerances of what is held"
+    held = held_coordinates(model, free)
+    parameters = identify(found[0], free, held, sensitivities(remembered, found[0], held))
     notes = warnings_of(parameters, len(free), len(problem.targets))
     rows = ", ".join(dict.fromkeys(t.row for t in problem.targets))
     costs = tuple(f.cost for f in found)
@@ -484,24 +569,22 @@ def calibrate(
 ) -> Calibration:
     """Calibrate named parameters on recordings.
 
-    Beside them, what belongs to one recording alone (place and stiffness of its object, zero of its encoder) is fitted
-    with its own prior.  Held-out error: every second closure takes no part in a further fit.
+    Beside them, what belongs to the recording alone (place and stiffness of its object, zero of its encoder; clock,
+    logger and gains where it does not describe them) is fitted with its own prior.  The noise is estimated anew where
+    the searches end, and the best of them goes on from there.  Held-out error: every second closure takes no part in a
+    further fit.
     Raises HannesError for a name that the plant cannot change.
     """
-    model, problem = prepared.model, prepared.problem
+    model = prepared.model
     _check_names(prepared, free)
     coordinates = free_coordinates(model, free, sds)
-    coordinates += [nuisance_coordinate(n) for n in prepared.nuisances if "@" in n.name]
+    bench = [n for n in prepared.nuisances if _of_the_recording(n.name) and n.name not in free]
+    coordinates += [nuisance_coordinate(n) for n in bench]
+    own = {c.name for c in coordinates}
+    held = [nuisance_coordinate(n) for n in prepared.nuisances if n.name not in own]
     used = data_used(prepared.features)
-    whitening = hashlib.sha256(
-        b"".join(np.ascontiguousarray(lower).tobytes() for _, lower in problem.whitener)
-    )
-    key = (
-        json.dumps([[d["sha256"], d["name"], d["closures"], d["signals"]] for d in used])
-        + whitening.hexdigest()
-    )
-    remembered = Remembered(problem, key, cache, progress)
-    remembered.total = starts * evaluations * (len(coordinates) + 1)
+    remembered = Remembered(prepared.problem, _key(prepared.problem, used), cache, progress)
+    remembered.total = (starts + 1) * evaluations * (len(coordinates) + 1)
 
     def announce(k: int, n: int) -> None:
         remembered.text = f"start {k + 1} of {n}"
@@ -509,15 +592,21 @@ def calibrate(
     found = search(
         remembered, model, coordinates, starts=starts, seed=seed, evaluations=evaluations, announce=announce
     )
-    best = found[0]
-    parameters = identify(best, free)
+    costs = tuple(f.cost for f in found)
+    problem = build_problem(prepared.rig, prepared.features, model, prepared.nuisances, found[0].values)
+    again = Remembered(problem, _key(problem, used), cache, progress)
+    again.done, again.total, again.text = remembered.done, remembered.total, "noise estimated anew"
+    best = fit(cast(Problem, again), model, coordinates, found[0].z, evaluations=evaluations)
+    again.text = "tolerances of what is held"
+    by_held = sensitivities(again, best, held)
+    parameters = identify(best, free, held, by_held)
     features = prepared.features
     before = overall(signal_errors(features, features.closures(prepared.rig, model, {})))
     after = overall(signal_errors(features, features.closures(prepared.rig, model, best.values)))
     errors = {"before": before, "after": after}
     if any(b.n > 1 for b in features.blocks):
         if progress is not None:
-            progress(remembered.done, max(remembered.total, remembered.done), "held-out closures")
+            progress(again.done, max(again.total, again.done), "held-out closures")
 
         def problem_of(train: Any) -> Any:
             return build_problem(prepared.rig, train, model, prepared.nuisances, best.values)
@@ -525,6 +614,8 @@ def calibrate(
         errors["train"], errors["held_out"] = held_out_closures(
             problem_of, features, model, coordinates, best.z
         )
+    if progress is not None:
+        progress(again.total, again.total, "done")
     bags = ", ".join(str(d["name"]) for d in used)
     made = calibrated_model(model, parameters, f"calibrated on {bags}")
     made = replace(
@@ -534,14 +625,24 @@ def calibrate(
             "bags": [{"source": d["source"], "sha256": d["sha256"], "closures": d["closures"]} for d in used],
             "nominal_sha256": model.sha256,
             "free": list(free),
+            "intervals_95": {p.name: [float(f"{p.low:.5g}"), float(f"{p.high:.5g}")] for p in parameters},
             "error_unit": "multiples of the repeatability between closures",
-            "errors": {k: round(v, 4) for k, v in errors.items()},
-            "recordings": {n: float(f"{v:.6g}") for n, v in best.values.items() if "@" in n},
+            "errors": {k: round(v, 4) for k, v in errors.items() if math.isfinite(v)},
+            "recordings": {n: float(f"{v:.6g}") for n, v in best.values.items() if n not in free},
         },
     )
     notes = warnings_of(parameters, len(free), features.size)
-    notes.append("What is not free is taken as exact; the intervals do not hold its uncertainty.")
-    costs = tuple(f.cost for f in found)
+    notes += _notes_of_errors(errors, best, explaining(best, held, by_held))
+    notes += [
+        f"{n} is marked as fixed in the parameter file ({model.parameters[n].source}); it is free because you named it."
+        for n in free
+        if n in model.parameters and model.parameters[n].fixed
+    ]
+    if held:
+        notes.append(
+            f"The intervals hold the tolerances (population.yaml) of {', '.join(c.name for c in held)}; "
+            "everything else that is not free is taken as exact."
+        )
     if starts > 1 and _agree(costs) == 1:
         notes.append("Only one start reached the best point; try more --starts.")
     return Calibration(
@@ -551,10 +652,62 @@ def calibrate(
         _agree(costs),
         errors,
         (*notes, *prepared.notes),
-        remembered.done - remembered.hits,
-        remembered.hits,
+        again.done - remembered.hits - again.hits,
+        remembered.hits + again.hits,
         best,
     )
+
+
+def _of_the_recording(name: str) -> bool:
+    """A nuisance parameter that says nothing of the hand."""
+    return "@" in name or name.startswith(("log.", "control."))
+
+
+def _key(problem: Problem, used: Sequence[Mapping[str, Any]]) -> str:
+    whitening = hashlib.sha256(
+        b"".join(np.ascontiguousarray(lower).tobytes() for _, lower in problem.whitener)
+    )
+    data = json.dumps([[d["sha256"], d["name"], d["closures"], d["signals"]] for d in used])
+    return data + whitening.hexdigest()
+
+
+def explaining(best: Fit, held: Sequence[Coordinate], by_held: Array) -> list[str]:
+    """Held parameters of which one alone, within its tolerance, would take away EXPLAINS of the misfit; best first."""
+    # What the free parameters cannot do as well: the part of H that their derivatives do not span.
+    rest = by_held - best.jacobian @ (best.covariance() @ (best.jacobian.T @ by_held))
+    gain = (rest.T @ best.residual) ** 2 / (1.0 + (rest**2).sum(axis=0)) / max(best.misfit, 1e-300)
+    return [held[k].name for k in np.argsort(-gain) if gain[k] > EXPLAINS]
+
+
+def _notes_of_errors(errors: Mapping[str, float], best: Fit, held: Sequence[str]) -> list[str]:
+    """Whether the calibrated model explains the recordings, and whether it says the same of other closures.
+
+    held  held parameters that would explain much of the misfit
+    """
+    if best.residual.size and np.abs(best.residual).min() >= FAILED:
+        return ["The simulation diverged at the best point; nothing was identified."]
+    after, train, held_out = (errors.get(k, math.nan) for k in ("after", "train", "held_out"))
+    out = []
+    if not math.isfinite(after):
+        out.append(
+            "One closure of each condition: there is no repeatability and no held-out closure to judge the model by."
+        )
+    elif after > LARGE_MISFIT:
+        rest = (
+            f"{' or '.join(held[:2])}, which is held, would explain much of it: free it too."
+            if held
+            else "Run `hannes diagnose`, or free what else is uncertain."
+        )
+        out.append(
+            f"The calibrated model misses the recordings by {after:.1f} times their repeatability: it lacks "
+            f"something, and the values make up for it. {rest}"
+        )
+    if held_out > 1.5 * train + 0.5:
+        out.append(
+            f"Held-out closures are missed by {held_out:.2f}, the others by {train:.2f} times the repeatability: "
+            "too many parameters for these closures."
+        )
+    return out
 
 
 def _check_names(prepared: Prepared, free: Sequence[str]) -> None:
@@ -564,15 +717,24 @@ def _check_names(prepared: Prepared, free: Sequence[str]) -> None:
     for trial in prepared.rig.trials:
         plant, _, _ = prepared.rig._plant(prepared.model, trial)
         settable |= set(plant.names)
-    unknown = [n for n in free if n not in settable or n.startswith("object.")]
+    if prepared.model.controller == "double_pid":
+        settable |= set(GAINS)
+    known = settable & {
+        *prepared.model.parameters,
+        *(f"{e.name}.{n}" for e in prepared.model.effects for n in e.parameters),
+    }
+    unknown = [n for n in free if n not in known]
     if unknown:
-        valid = sorted(n for n in settable if not n.startswith(("object.", "geometry.", "inertia.")))
+        close = [m for n in unknown for m in get_close_matches(n, sorted(known), 2)]
+        hint = f" Did you mean {' or '.join(dict.fromkeys(close))}?" if close else ""
+        valid = sorted(n for n in known if not n.startswith(("geometry.", "inertia.")))
         raise HannesError(
             f"--free {', '.join(unknown)}: not a parameter that the plant '{prepared.model.plant}' can "
-            f"change; valid are {', '.join(valid)}."
+            f"change.{hint} Valid are {', '.join(valid)}."
         )
 
 
+@interruptible
 def command(
     bags: Annotated[list[Path], typer.Argument(help="Bags, or folders of bags, of your hand.")],
     free: Annotated[str, typer.Option("--free", help="Names of the free parameters, with commas between.")],
@@ -598,6 +760,10 @@ def command(
     from .cli import _command, _console, _number, _prepared, _print_json, _Progress
 
     names = [n.strip() for n in free.split(",") if n.strip()]
+    if out.suffix not in (".yaml", ".yml"):
+        raise HannesError(f"--out {out}: a model file ends in .yaml.")
+    if not out.resolve().parent.is_dir():
+        raise HannesError(f"--out {out}: the folder '{out.resolve().parent}' does not exist.")
     sds = {}
     for text in prior or ():
         name, _, value = text.partition("=")
