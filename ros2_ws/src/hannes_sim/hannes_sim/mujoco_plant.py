@@ -429,6 +429,17 @@ class MujocoPlant:
             self.data.qpos[:], self.data.qvel[:] = old.qpos, old.qvel
             self.data.qacc_warmstart[:] = old.qacc_warmstart
 
+    def set_dry_friction(self, levels: dict[str, float]) -> None:
+        """Dry friction [N.m] of joints by name, in place of what follows from the parameters until the next rebuild."""
+        for name, level in levels.items():
+            if name not in JOINT_NAMES:
+                raise HannesError(f"No joint '{name}'; valid are {', '.join(JOINT_NAMES)}.")
+            if not (math.isfinite(level) and level >= 0.0):
+                raise HannesError(f"The dry friction of joint '{name}' is {level} N.m; it must be finite, at least 0.")
+            index = JOINT_NAMES.index(name)
+            self._table[_T_FRICTION + index] = level
+            self.model.dof_frictionloss[self._counts[_C_JOINTS + index]] = level
+
     def _opening(self) -> float:
         return self._values.value("hand.opening")
 

@@ -20,7 +20,6 @@ from hannes_control.reference import half_sine
 from hannes_description.joints import DIGITS, FINGERS, JOINT_NAMES
 from hannes_description.mjcf import joints_of, return_moments
 from hannes_description.model import Model
-from hannes_sim import mujoco_plant
 from hannes_sim.mujoco_plant import MujocoPlant
 from hannes_sim.plant import PlantDiverged
 from hannes_sim.rollout import rollout
@@ -120,13 +119,13 @@ class Forces:
         plant = MujocoPlant(
             self.model.with_values({name: v(name) * math.exp(x[k]) for k, name in enumerate(self.names)})
         )
-        for k, digit in enumerate(DIGITS):
-            for joint in joints_of(digit):
-                level = (
-                    v("joints.friction_tension") * v(f"pulleys.{joint}") * math.exp(x[len(self.names) + k])
-                )
-                # the kernel's own table: it writes MuJoCo's dry friction from it at every step
-                plant._table[mujoco_plant._T_FRICTION + JOINT_NAMES.index(joint)] = level
+        plant.set_dry_friction(
+            {
+                joint: v("joints.friction_tension") * v(f"pulleys.{joint}") * math.exp(x[len(self.names) + k])
+                for k, digit in enumerate(DIGITS)
+                for joint in joints_of(digit)
+            }
+        )
         return closure(plant, self.model)
 
 
