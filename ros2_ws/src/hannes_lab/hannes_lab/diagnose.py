@@ -301,15 +301,16 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
 
     Sets of one, two and three effects in turn; each round extends the best of the round before by every effect, so that
     two effects of which neither is best alone are found too.  After each round noise, scatter and critical values are
-    estimated afresh at the best point: those of a wrong model are wrong.
+    estimated afresh at the best point: those of a wrong model are wrong.  Where the misfit is within chance already, only
+    sets that are nearly as good as the best are extended.
     """
     choice = _Choice(search, null, limits, null.fit.cost <= ADEQUATE * limits.misfit, ())
-    front = [null]
+    front, far = [null], list[Candidate]()
     texts = ("one effect", "two effects", "three effects")
     for size in range(1, max_effects + 1):
-        if size > 1:
-            front = [*front[:1], *choice.search.refitted(front[1:])]
         enough = choice.best.fit.cost <= choice.limits.misfit
+        if not enough and size > 1:
+            front += choice.search.refitted(far)
         needed = choice.limits.gain if enough else max(choice.limits.gain, WORTHWHILE * choice.best.fit.cost)
         worth = choice.best.penalised - 0.5 * needed
         round_ = choice.search.extend(front, list(search.sources), texts[size - 1], worth)
@@ -331,7 +332,7 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         limits_new = chance(new.problem, best.fit, new.signatures(best))
         close = tuple(c for c in near[1:] if c.penalised <= best.penalised + TIE)
         choice = _Choice(new, best, limits_new, best.fit.cost <= ADEQUATE * limits_new.misfit, ranking, close)
-        front = [best, *near[1:], *(c for c in wide if c not in rivals)]
+        front, far = [best, *near[1:]], [c for c in wide if c not in rivals]
     return choice
 
 

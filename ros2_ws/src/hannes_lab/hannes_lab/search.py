@@ -276,7 +276,15 @@ class Search:
             )
             for start in starts
         ]
-        return self._keep(base, name, min(tried, key=lambda f: f.cost))
+        best = min(tried, key=lambda f: f.cost)
+        if best.cost > base.fit.cost:
+            # The set contains the base: the search was led astray, and starts again from where the base is.
+            strengths = {f"{name}.{p.name}" for p in self.effect(name).parameters if p.vanishing is not None}
+            here = {c.name: float(z) for c, z in zip(base.fit.coordinates, base.fit.z, strict=True)}
+            at = {**starts[0], **here, **dict.fromkeys(strengths, 0.0)}
+            again = fit(problem, model, coordinates, at, rows=self.rows, evaluations=10)
+            best = min(best, again, key=lambda f: f.cost)
+        return self._keep(base, name, best)
 
     def _true_start(
         self, base: Fit, model: Model, coordinates: Sequence[Coordinate], start: Mapping[str, float]
