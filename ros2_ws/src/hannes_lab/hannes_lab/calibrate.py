@@ -89,6 +89,9 @@ LAB_SOURCES = (
 SPREAD = 0.5
 """Scatter of the further starts, in prior standard deviations."""
 
+RESTARTS = 2
+"""How often a search goes on from its own end at most."""
+
 STEP = 0.02
 """Finite-difference step: of the logarithm, or of the prior's standard deviation."""
 
@@ -258,7 +261,7 @@ class Identified:
 class Calibration:
     """What a calibration found.
 
-    costs    least-squares cost of every start's end, best first; agree: how many ended within 1 % of the best
+    costs    least-squares cost of every start's end, best first; agree: how many ended as well as the best
     errors   training and held-out error in multiples of the repeatability (recordings), before and after
     """
 
@@ -341,7 +344,11 @@ def search(
     first: Mapping[str, float] | None = None,
     announce: Callable[[int, int], None] | None = None,
 ) -> list[Fit]:
-    """Fits from the nominal point (or `first`, z by name) and from points drawn from the priors, best first."""
+    """Fits from the nominal point (or `first`, z by name) and from points drawn from the priors, best first.
+
+    Dry friction makes the figures a little rough, on which a search may stop short; so each goes on from its end with a
+    new trust region until that gains nothing.
+    """
     if starts < 1:
         raise HannesError(f"A calibration needs at least one start, not {starts}.")
     rng = np.random.default_rng(seed)
@@ -351,7 +358,14 @@ def search(
         if announce is not None:
             announce(k, starts)
         z = begin if k == 0 else begin + SPREAD * np.clip(rng.standard_normal(len(coordinates)), -1.5, 1.5)
-        found.append(fit(cast(Problem, problem), model, coordinates, z, evaluations=evaluations))
+        best = fit(cast(Problem, problem), model, coordinates, z, evaluations=evaluations)
+        for _ in range(RESTARTS):
+            again = fit(cast(Problem, problem), model, coordinates, best.z, evaluations=evaluations)
+            gain = best.cost - again.cost
+            best = min(best, again, key=lambda f: f.cost)
+            if gain < _close(best.cost):
+                break
+        found.append(best)
     return sorted(found, key=lambda f: f.cost)
 
 
@@ -552,8 +566,13 @@ def calibrate_targets(
     )
 
 
+def _close(cost: float) -> float:
+    """Difference of two costs that says nothing: 1 % of the cost, or half of one standard deviation of the data."""
+    return max(0.01 * cost, 0.5)
+
+
 def _agree(costs: Sequence[float]) -> int:
-    return sum(c <= 1.01 * costs[0] + 1e-6 for c in costs)
+    return sum(c <= costs[0] + _close(costs[0]) for c in costs)
 
 
 def calibrate(
@@ -583,7 +602,9 @@ def calibrate(
     own = {c.name for c in coordinates}
     held = [nuisance_coordinate(n) for n in prepared.nuisances if n.name not in own]
     used = data_used(prepared.features)
-    remembered = Remembered(prepared.problem, _key(prepared.problem, used), cache, progress)
+    # A slow plant may have been prepared through a fast one, which lacks the parameters of the mechanics.
+    exact = prepared.problem.with_rig(prepared.rig)
+    remembered = Remembered(exact, _key(exact, used), cache, progress)
     remembered.total = (starts + 1) * evaluations * (len(coordinates) + 1)
 
     def announce(k: int, n: int) -> None:
