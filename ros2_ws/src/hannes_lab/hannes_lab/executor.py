@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import copy
 import functools
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, ParamSpec
 
@@ -64,7 +66,9 @@ class Executor:
                 batch_size=1,  # type: ignore[arg-type]  # its stubs know "auto" only
             )
             try:
-                yield from parallel(tasks)
+                with _deaf_workers():
+                    results = parallel(tasks)
+                yield from results
             except TerminatedWorkerError as error:
                 raise HannesError(
                     "A worker process was killed, most likely for want of memory; try fewer --jobs. What was found is "
@@ -98,6 +102,22 @@ class Executor:
         if self._client is not None:
             self._client.close()
             self._client = None
+
+
+@contextmanager
+def _deaf_workers() -> Iterator[None]:
+    """Processes that start in this block ignore Ctrl-C: they end with this process, and say nothing.
+
+    For those milliseconds this process ignores it too; that it is ignored is what its children inherit.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _numbered(number: int, code: str | None, work: Work, shared: Any, key: str, item: tuple[Any, ...]) -> Any:
