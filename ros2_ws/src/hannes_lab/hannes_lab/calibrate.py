@@ -73,18 +73,9 @@ ON_BOUND = 0.01
 GAINS = tuple(f"control.{name}" for name in ("kp", "damping", "current_kp", "current_ki"))
 """Gains of the double PID that may be free: a rollout can change them."""
 
-LAB_SOURCES = (
-    "features.py",
-    "rig.py",
-    "surrogate.py",
-    "trials.py",
-    "problem.py",
-    "hand.py",
-    "currents.py",
-    "least_force.py",
-    "fitting.py",
-)
-"""Files of the lab that stand between a simulation and its residual."""
+BAG_SOURCES = ("features.py", "rig.py", "trials.py", "problem.py", "hand.py")
+FIGURE_SOURCES = ("currents.py", "least_force.py", "fitting.py")
+"""Files of the lab that stand between a simulation and its residual: of recordings, of the thesis' figures."""
 
 SPREAD = 0.5
 """Scatter of the further starts, in prior standard deviations."""
@@ -187,12 +178,7 @@ class Remembered:
             self._progress(self.done, max(self.total, self.done), self.text)
         if self.folder is None:
             return np.asarray(self.problem.residual(model, values), dtype=np.float64)
-        text = (
-            code_digest()
-            + self.key
-            + model.sha256
-            + json.dumps(sorted((k, float(v)) for k, v in values.items()))
-        )
+        text = self.key + model.sha256 + json.dumps(sorted((k, float(v)) for k, v in values.items()))
         path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()}.f8"
         if path.exists():
             try:
@@ -211,14 +197,17 @@ class Remembered:
 
 
 @cache_once
-def code_digest() -> str:
-    """Hash of the sources that a simulation depends on: a changed simulator finds no old results."""
+def code_digest(lab: tuple[str, ...]) -> str:
+    """Hash of the sources that a simulation depends on: a changed simulator finds no old results.
+
+    lab  files of hannes_lab that count; of the simulator's packages all do
+    """
     found = hashlib.sha256()
     for package in ("hannes_description", "hannes_control", "hannes_sim", "hannes_lab"):
         spec = find_spec(package)
         for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
             for path in sorted(Path(folder).rglob("*.py")):
-                if package != "hannes_lab" or path.name in LAB_SOURCES:
+                if package != "hannes_lab" or path.name in lab:
                     found.update(path.name.encode() + path.read_bytes())
     return found.hexdigest()
 
@@ -467,6 +456,7 @@ def identify(
 def warnings_of(parameters: Sequence[Identified], free_count: int, data_count: int) -> list[str]:
     """What the user must know of parameters that the data do not identify."""
     out = []
+    pairs: set[frozenset[str]] = set()
     for p in parameters:
         if p.narrowing > UNIDENTIFIED:
             by_held = p.held_share > 0.5
@@ -480,7 +470,8 @@ def warnings_of(parameters: Sequence[Identified], free_count: int, data_count: i
                     + (f" (confounded with {p.confounded})." if p.confounded else ".")
                 )
             )
-        elif p.confounded:
+        elif p.confounded and frozenset((p.name, p.confounded)) not in pairs:
+            pairs.add(frozenset((p.name, p.confounded)))
             out.append(
                 f"{p.name} and {p.confounded} cannot be told apart by these data (correlation "
                 f"{p.correlation:+.3f}); only a combination of both is identified. Fix one of them."
@@ -530,7 +521,7 @@ def calibrate_targets(
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrate on published figures."""
-    remembered = Remembered(problem, problem.key, cache, progress)
+    remembered = Remembered(problem, code_digest(FIGURE_SOURCES) + problem.key, cache, progress)
     remembered.total = starts * evaluations * (len(coordinates) + 1)
 
     def announce(k: int, n: int) -> None:
@@ -689,7 +680,7 @@ def _key(problem: Problem, used: Sequence[Mapping[str, Any]]) -> str:
         b"".join(np.ascontiguousarray(lower).tobytes() for _, lower in problem.whitener)
     )
     data = json.dumps([[d["sha256"], d["name"], d["closures"], d["signals"]] for d in used])
-    return data + whitening.hexdigest()
+    return code_digest(BAG_SOURCES) + data + whitening.hexdigest()
 
 
 def explaining(best: Fit, held: Sequence[Coordinate], by_held: Array) -> list[str]:
@@ -721,7 +712,7 @@ def _notes_of_errors(errors: Mapping[str, float], best: Fit, held: Sequence[str]
         )
         out.append(
             f"The calibrated model misses the recordings by {after:.1f} times their repeatability: it lacks "
-            f"something, and the values make up for it. {rest}"
+            f"something, the values make up for it, and the intervals may be too narrow. {rest}"
         )
     if held_out > 1.5 * train + 0.5:
         out.append(
