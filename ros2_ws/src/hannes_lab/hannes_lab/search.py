@@ -58,7 +58,9 @@ KEEP = 1
 """Points of each scan (from the base fit, and from the nominal values) from which an effect is refitted."""
 
 REFIT = 8
-"""Extensions of a round that are refitted in closed loop."""
+REFIT_ALL = 32
+"""Extensions of a round that are refitted in closed loop; all of them where there are few.  A scan does not see an effect
+that a nuisance parameter has taken over far from its nominal value."""
 
 POLISH = 3
 """Extensions of a round that are refitted with all derivatives afresh."""
@@ -365,8 +367,8 @@ class Search:
     ) -> list[Candidate]:
         """The bases with one further effect each, sorted by penalised cost.
 
-        All extensions are scanned; the REFIT most promising are refitted in closed loop, the POLISH best of them
-        with all derivatives taken afresh, as far as their penalised cost is below `worth`.
+        All extensions are scanned; the most promising are refitted in closed loop, the POLISH best of them with all
+        derivatives taken afresh, as far as their penalised cost is below `worth`.
         """
         todo: dict[Names, tuple[Candidate, str]] = {}
         for base in bases:
@@ -377,7 +379,7 @@ class Search:
         self._prior_points = {_point_of(base.fit): point for base, point in zip(bases, points, strict=True)}
         scans = self.each(_scan_in_worker, list(todo.values()), f"{text}: scan")
         order = sorted(zip(todo.values(), scans, strict=True), key=lambda item: item[1][0][0])
-        chosen = [(base, name, [s for _, s in starts]) for (base, name), starts in order[:REFIT]]
+        chosen = [(base, name, [s for _, s in starts]) for (base, name), starts in order[: REFIT if len(order) > REFIT_ALL else None]]
         refitted = self.each(_add_in_worker, chosen, f"{text}: refit")
         for candidate in refitted:
             self.found[tuple(sorted(candidate.names))] = candidate
