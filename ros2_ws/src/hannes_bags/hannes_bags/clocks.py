@@ -5,8 +5,9 @@ header stamp, at which it was measured. Messages without a header (the Float64 t
 If the recorder ran on the computer's clock while the stamps are simulated time (or another computer's clock),
 the two do not compare: the log times are then carried over onto the clock of the stamps.
 
-- same      the stamps are within 0.1 s of the log times: log times are used as they are.
-- offset    the two run at one rate with a constant difference: the median difference is subtracted.
+- same      the stamps are up to 20 ms before the log times: log times are used as they are.
+- offset    the two run at one rate with a constant difference, and what was logged before it was measured was measured on
+            another clock: the median difference is subtracted.
 - warped    they run at different rates (a simulation faster or slower than real time): log times are
             interpolated between the pairs (log time, stamp) of the stamped topic. A header-less message then
             lies between the stamped messages around it, so its time is right to one period of that topic and
@@ -25,7 +26,8 @@ import numpy.typing as npt
 IntArray = npt.NDArray[np.int64]
 Kind = Literal["log", "same", "offset", "warped"]
 
-SAME_NS = 100_000_000
+SAME_NS = 20_000_000
+_EARLIEST_NS = -2_000_000
 _STEADY_NS = 50_000_000
 
 
@@ -82,7 +84,7 @@ def relate(topic: str, stamp_ns: IntArray, log_ns: IntArray) -> ClockRelation:
     """Decide how the log times of a bag compare with the stamps (n,) of one of its topics."""
     difference = log_ns - stamp_ns
     offset = int(np.median(difference))
-    if abs(offset) < SAME_NS:
+    if _EARLIEST_NS <= offset < SAME_NS:
         return ClockRelation("same", offset, topic)
     if np.quantile(np.abs(difference - offset), 0.95) < _STEADY_NS:
         return ClockRelation("offset", offset, topic)

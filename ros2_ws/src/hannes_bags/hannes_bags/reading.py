@@ -101,7 +101,7 @@ def read_bag(
     limits  how much is read at most; by default 5 million messages and 1 GiB
 
     Raises HannesError: unreadable or damaged bag, ambiguous or missing topic, wrong type, undecodable
-    message, NaN, stamps that go back.
+    message, stamps that go back. Samples that are not finite are left out, with a warning.
     """
     bag = locate(path)
     messages = BagMessages(bag, limits or Limits())
@@ -182,7 +182,11 @@ class _Reader:
                 times, values = self._plain(topic, signals[0])
                 samples[signals[0].name] = (relation.apply(times), values)
                 self._drop_repeats([signals[0].name], samples)
-        ordered = {name: self._in_order(name, *samples[name]) for name in SIGNALS if name in samples}
+        ordered = {
+            name: self._in_order(name, *finite)
+            for name in SIGNALS
+            if name in samples and (finite := self._finite(name, *samples[name])) is not None
+        }
         if not ordered:
             raise HannesError(f"The bag {self.path} has no usable signal. " + " ".join(self.warnings))
         return self._assemble(ordered, chosen, relation, sha256)
@@ -371,6 +375,22 @@ class _Reader:
         self.warnings.append(
             f"The messages on {topic} lack the joints {', '.join(missing)}: there are no joint_positions."
         )
+
+    def _finite(
+        self, name: str, times: IntArray, values: npt.NDArray[Any]
+    ) -> tuple[IntArray, npt.NDArray[Any]] | None:
+        """The samples without NaN and infinity; None if none is left."""
+        if values.dtype.kind != "f":
+            return times, values
+        good = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+        if good.all():
+            return times, values
+        first = int(np.argmin(good))
+        self.warnings.append(
+            f"{int((~good).sum())} of {len(good)} samples of {name} are not finite numbers (the first is message {first}); "
+            "they were left out."
+        )
+        return (times[good], values[good]) if good.any() else None
 
     def _in_order(
         self, name: str, times: IntArray, values: npt.NDArray[Any]

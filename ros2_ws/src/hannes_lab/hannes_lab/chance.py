@@ -22,6 +22,10 @@ MIN_CLOSURES = 5
 """Fewer closures cannot be resampled: their signs span too few draws."""
 
 
+OWN_ERROR_CAUTION = 2.0
+"""Where the model has an error of its own, of which only a width is assumed, an effect must gain so many times more."""
+
+
 @dataclass(frozen=True)
 class Chance:
     """Quantiles under "nothing is missing".
@@ -92,7 +96,7 @@ def chance(
                 gains = np.maximum(gains, ((q.T @ left) ** 2).sum(axis=0))
     return Chance(
         float(np.quantile(misfit, level)),
-        float(np.quantile(gains, level)),
+        float(np.quantile(gains, level)) * (OWN_ERROR_CAUTION if problem.discrepancy else 1.0),
         float(np.median(misfit)),
         draws,
         resampled,

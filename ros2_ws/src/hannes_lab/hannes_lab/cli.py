@@ -13,9 +13,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_sim.effect import effect_source, load_effect, strength_of
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -27,8 +29,10 @@ from .compare import compare as compare_model
 from .diagnose import MAX_EFFECTS, Diagnosis, effect_sources
 from .diagnose import diagnose as diagnose_model
 from .executor import Executor, interruptible
+from .own_effect import check_own_effects
 from .prepare import Prepared, load_trials, prepare
 from .rig import load_rig
+from .trials import UNITS
 
 Bags = Annotated[list[Path], typer.Argument(help="Bags, or folders of bags; one bag may hold many closures.")]
 ModelFile = Annotated[str, typer.Option("--model", help="Model file, or the name of a shipped model.")]
@@ -40,6 +44,13 @@ Objects = Annotated[
     list[str] | None,
     typer.Option(
         "--object", help="What a condition holds, as CONDITION=none|soft|rigid; overrides the bag's metadata."
+    ),
+]
+Scale = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--scale",
+        help="Factor of a signal to SI (rad at the pulley, A, V, N), as SIGNAL=FACTOR; 1 where the guess is wrong.",
     ),
 ]
 RigFile = Annotated[
@@ -63,7 +74,9 @@ Signals = Annotated[list[str] | None, typer.Option("--signal", help="Compare onl
 Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Worker processes.")]
 Dask = Annotated[
     str | None,
-    typer.Option("--dask", help="Work on the Dask cluster whose scheduler is at this address (tcp://HOST:8786)."),
+    typer.Option(
+        "--dask", help="Work on the Dask cluster whose scheduler is at this address (tcp://HOST:8786)."
+    ),
 ]
 NoCache = Annotated[
     bool,
@@ -118,6 +131,7 @@ def _prepared(
     objects: Sequence[str] | None,
     signals: Sequence[str] | None,
     rig: str | None = None,
+    scale: Sequence[str] | None = None,
 ) -> Prepared:
     machine = load_rig(rig) if rig else None
     if machine is not None and model == "nominal":
@@ -128,7 +142,10 @@ def _prepared(
         if not what:
             raise HannesError(f"--object {text}: give CONDITION=none|soft|rigid.")
         given[name] = what
-    trials = machine.read(bags) if machine else load_trials(bags)
+    factors = _factors(scale)
+    if machine and factors:
+        raise HannesError("--scale is for bags; with --rig the adapter's reader says what the units are.")
+    trials = machine.read(bags) if machine else load_trials(bags, scale=factors)
     unknown = sorted(set(given) - {t.name for t in trials})
     if unknown:
         raise HannesError(
@@ -141,8 +158,40 @@ def _prepared(
     return prepare(trials, Model.load(model), rig=machine, signals=signals, surrogate=True)
 
 
+def _factors(scale: Sequence[str] | None) -> dict[str, float]:
+    """Factors to SI by signal name."""
+    out = {}
+    for text in scale or ():
+        name, _, factor = text.partition("=")
+        try:
+            out[name] = float(factor)
+        except ValueError:
+            out[name] = math.nan
+        if not (math.isfinite(out[name]) and out[name] != 0.0):
+            raise HannesError(f"--scale {text}: give SIGNAL=FACTOR with a number that is not 0.")
+        if name not in ("reference_position", *UNITS):
+            raise HannesError(
+                f"--scale {text}: unknown signal; valid are {', '.join(('reference_position', *UNITS))}."
+            )
+    return out
+
+
 def _executor(jobs: int, dask: str | None, no_cache: bool) -> Executor:
     return Executor(jobs, dask, None if no_cache else Store())
+
+
+def _check_effects(prepared: Prepared, sources: Sequence[str]) -> None:
+    """Try the user's own effects on the shortest closure before working with them."""
+    trial = min(prepared.features.trials, key=lambda t: t.closures[0].stop)
+    reference = trial.reference[: round(trial.closures[0].stop / trial.period)]
+
+    def simulate(source: str) -> None:
+        kind = prepared.rig.effect(load_effect(source))
+        entry = kind.entry({p.name: p.typical for p in kind.parameters}, source=effect_source(kind, source))
+        prepared.rig.simulate(prepared.model.with_effect(entry), {}, trial, reference)
+
+    ticks = np.arange(0, reference.size, max(1, reference.size // 400))
+    check_own_effects(sources, simulate, (np.asarray(ticks * trial.period), reference[ticks]))
 
 
 def _print_json(content: dict[str, Any]) -> None:
@@ -179,13 +228,14 @@ def compare(
         bool, typer.Option("--fitted", help="Fit the uncertain nominal parameters first.")
     ] = False,
     objects: Objects = None,
+    scale: Scale = None,
     signals: Signals = None,
     rig: RigFile = None,
     report: ReportFile = None,
     json: Json = False,
 ) -> None:
     """Compare the model with recorded closures: where does it fail, and by how much?"""
-    prepared = _prepared(bags, model, objects, signals, rig)
+    prepared = _prepared(bags, model, objects, signals, rig, scale)
     result = compare_model(prepared, fitted=fitted)
     if report:
         _write_report(report, comparison=result, after=None, diagnosis=None)
@@ -248,6 +298,7 @@ def diagnose(
     add: Annotated[bool, typer.Option("--add", help="Write the model with what was found to --out.")] = False,
     out: Annotated[Path, typer.Option("--out", help="Model file that --add writes.")] = Path("my_hand.yaml"),
     objects: Objects = None,
+    scale: Scale = None,
     signals: Signals = None,
     rig: RigFile = None,
     max_effects: MaxEffects = MAX_EFFECTS,
@@ -259,7 +310,8 @@ def diagnose(
     json: Json = False,
 ) -> None:
     """Which physical effect does the model lack: nothing, effects of the catalogue, or something unknown?"""
-    prepared = _prepared(bags, model, objects, signals, rig)
+    prepared = _prepared(bags, model, objects, signals, rig, scale)
+    _check_effects(prepared, [*(only or ()), *(effects or ())])
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
         found = diagnose_model(
             prepared,
@@ -351,6 +403,7 @@ def add(
     model: ModelFile = "nominal",
     out: Annotated[Path, typer.Option("--out", help="Model file to write.")] = Path("my_hand.yaml"),
     objects: Objects = None,
+    scale: Scale = None,
     signals: Signals = None,
     rig: RigFile = None,
     jobs: Jobs = _JOBS,
@@ -360,7 +413,8 @@ def add(
     json: Json = False,
 ) -> None:
     """Add effects to the model, fit them, and show the error fall on held-out data."""
-    prepared = _prepared(bags, model, objects, signals, rig)
+    prepared = _prepared(bags, model, objects, signals, rig, scale)
+    _check_effects(prepared, effects or ())
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
         found = add_effects(
             prepared,
@@ -404,7 +458,12 @@ def hide(
     seed: Annotated[int, typer.Option(help="Seed of hand, scatter and noise.")] = 0,
     closures: Annotated[int, typer.Option(min=1, help="Closures per condition.")] = 13,
     conditions: Annotated[
-        list[str] | None, typer.Option("--condition", help="Conditions (default slow fast grasp).")
+        list[str] | None,
+        typer.Option(
+            "--condition",
+            help="Condition, once for each: slow, fast, creep (on nothing), grasp (rigid), grasp_soft, grasp_fast "
+            "(soft); default slow fast grasp.",
+        ),
     ] = None,
     sensors: Annotated[
         str, typer.Option(help="thesis (30 Hz rectified current) or bench (100 Hz, signed).")
@@ -412,21 +471,25 @@ def hide(
     json: Json = False,
 ) -> None:
     """Make a measurement set with a hidden effect, to test the lab or to learn what an effect looks like."""
-    from hannes_sim.effect import strength_of
-
     from .hide import DEFAULT_CONDITIONS, make_set, write_set
 
-    entries = []
+    wanted: dict[str, float] = {}
     for text in effects or ():
         name, _, factor = text.partition("=")
         try:
-            entries.append(strength_of(name, float(factor) if factor else 1.0))
-        except HannesError:
-            raise
+            wanted[name] = float(factor) if factor else 1.0
         except ValueError as error:
             raise HannesError(
                 f"--effect {text}: give NAME or NAME=FACTOR with a number as the factor."
             ) from error
+
+    def simulate(source: str) -> None:
+        entry = strength_of(source, wanted[source])
+        make_set(Model.load(model), [entry], seed=seed, closures=1, conditions=["fast"], scatter=0.0)
+
+    time_ = np.arange(0.0, 2.0, 5e-3)
+    check_own_effects(wanted, simulate, (time_, 13.0 * np.maximum(0.0, np.sin(np.pi * time_))))
+    entries = [strength_of(name, factor) for name, factor in wanted.items()]
     recordings, hidden = make_set(
         Model.load(model),
         entries,
@@ -449,6 +512,7 @@ def report(
     model: ModelFile = "nominal",
     effects: Effects = None,
     objects: Objects = None,
+    scale: Scale = None,
     signals: Signals = None,
     rig: RigFile = None,
     max_effects: MaxEffects = MAX_EFFECTS,
@@ -459,7 +523,8 @@ def report(
     json: Json = False,
 ) -> None:
     """Compare, diagnose and add, all on one self-contained HTML page."""
-    prepared = _prepared(bags, model, objects, signals, rig)
+    prepared = _prepared(bags, model, objects, signals, rig, scale)
+    _check_effects(prepared, effects or ())
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
         found = diagnose_model(
             prepared,

@@ -31,11 +31,19 @@ _PER_OBJECT = ("object.stiffness", "object.position")
 
 _UNKNOWN_OBJECT_SD = {"object.stiffness": 1.5, "object.position": 2.0}
 _UNKNOWN_DAMPING_SD = 1.5
-"""Widths of the priors of an object of which only the kind is known (stiffness, damping: of the logarithm; place: rad)."""
+"""Widths of the priors of an object of which only the kind is known (of the logarithm, of the place in rad)."""
 
-_UNKNOWN_GAINS = {"control.kp": 0.2, "control.damping": 0.5, "control.current_kp": 1.2, "control.current_ki": 1.2}
+_UNKNOWN_GAINS = {
+    "control.kp": 0.2,
+    "control.damping": 0.5,
+    "control.current_kp": 1.2,
+    "control.current_ki": 1.2,
+}
 """Gains of a controller that nobody described, with the widths of their priors (of the logarithm): the outer loop shows
 in the static error; of the inner one the thesis gives the order of magnitude."""
+
+_UNKNOWN_ZERO_SD = 0.05
+"""rad; what a hand calls open whose homing nobody described."""
 
 _WIRE = "wire.stiffness"
 _UNKNOWN_WIRE_SD = 0.5
@@ -54,12 +62,12 @@ _SMOOTHED = 0.03
 
 OWN_ERROR: Mapping[str, float] = {"encoder_position": 0.003}
 OWN_ERROR_DRIVE = 0.02
-"""Of a signal's span: how far the form of the model may be from that of a hand that is not this simulator's.  The loop holds
-the position; what the model does not know shows in what drives it."""
+"""Of a signal's span: how far the form of the model may be from that of a hand that is not this simulator's.  The loop
+holds the position; what the model does not know shows in what drives it."""
 
 AT_REST = 10.0
-"""How many times larger that is once the reference is back at rest: the hand lies against its open stop on a slack wire, of
-which nothing is known."""
+"""How many times larger that is once the reference is back at rest: the hand lies against its open stop on a slack
+wire, of which nothing is known."""
 
 REFERENCE_LEAD = "log.reference_lead"
 LEAD_SEEN = 0.02
@@ -147,16 +155,25 @@ class HandRig(PlantRig):
                     if object_of(trial) is None:
                         continue
                     plant, _, _ = self._plant(model.without_effects(), trial)
-                    width = sd if is_described(trial) else _UNKNOWN_OBJECT_SD[name]
+                    known = is_described(trial) and not trial.options.get("object_seen")
+                    width = sd if known else _UNKNOWN_OBJECT_SD[name]
                     out.append(Nuisance(f"{name}@{trial.name}", plant.get(name), width, relative, scatter))
                     damping = "object.damping"
-                    if name == "object.stiffness" and not is_described(trial) and damping in plant.names:
+                    if name == "object.stiffness" and not known and damping in plant.names:
                         out.append(
                             Nuisance(f"{damping}@{trial.name}", plant.get(damping), _UNKNOWN_DAMPING_SD, True)
                         )
             elif name == "encoder.zero":
                 out += [
-                    Nuisance(f"{name}@{trial.name}", 0.0, sd, False, scatter, "rad") for trial in self.trials
+                    Nuisance(
+                        f"{name}@{trial.name}",
+                        0.0,
+                        sd if is_described(trial) else _UNKNOWN_ZERO_SD,
+                        False,
+                        scatter,
+                        "rad",
+                    )
+                    for trial in self.trials
                 ]
             elif model.parameters.value(name) > 0.0:
                 out.append(self._nuisance(name, entry, model))
@@ -266,9 +283,9 @@ class HandRig(PlantRig):
 def outer_loop(trials: Sequence[Trial]) -> tuple[float, float, float] | None:
     """Gain [A/rad], damping [A.s/rad] and delay of the reference [s] of the outer loop, as the recordings show them.
 
-    While the inner loop keeps up, i = kp (r - tau r' - q) - kd q', whatever the motor drives; so r - q is linear in i, q'
-    and r'.  A negative tau is a controller that sees the reference's rate too (a derivative of the error).  None where
-    the recordings do not show it.
+    While the inner loop keeps up, i = kp (r - tau r' - q) - kd q', whatever the motor drives; so r - q is linear in
+    i, q' and r'.  A negative tau is a controller that sees the reference's rate too (a derivative of the error).
+    None where the recordings do not show it.
     """
     rows = []
     for trial in trials:
@@ -300,7 +317,7 @@ def outer_loop(trials: Sequence[Trial]) -> tuple[float, float, float] | None:
 
 
 def _moved(reference: Array, delay: float, lead: float, trial: Trial) -> Array:
-    """The reference later by `delay` [s] and with `lead` [s] times its rate; after a cut one comes that of the trial."""
+    """The reference later by `delay` [s] and with `lead` [s] times its rate; a cut one goes on as the trial's."""
     if delay == 0.0 and lead == 0.0:
         return reference
     n = reference.size

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from hannes_description.model import Model
 
 from .features import Features, build_features
 from .fit import fit
+from .grasp import with_seen_objects
 from .hand import HandRig
 from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig
@@ -62,13 +63,15 @@ def _storage(path: Path) -> list[Path]:
     return [p for p in path.iterdir() if p.suffix in (".mcap", ".db3")]
 
 
-def load_trials(paths: Sequence[str | Path], signals: Sequence[str] = SIGNALS) -> list[Trial]:
-    """Trials of all bags below the paths; names are made unique."""
+def load_trials(
+    paths: Sequence[str | Path], signals: Sequence[str] = SIGNALS, scale: Mapping[str, float] | None = None
+) -> list[Trial]:
+    """Trials of all bags below the paths; names are made unique. `scale`: factors to SI by signal name."""
     trials = []
     for bag in find_bags(paths):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the reader's warnings are kept in the trial's notes
-            trials.append(make_trial(read_bag(bag), signals=signals))
+            trials.append(make_trial(read_bag(bag), signals=signals, scale=scale))
     return unique_names(trials)
 
 
@@ -115,6 +118,8 @@ def prepare(
     surrogate  search a slow plant through a fast one (surrogate.py); `rig` of the result is the exact one
     """
     trials = [without_outliers(trial) for trial in trials]
+    if rig is None:
+        trials = with_seen_objects(trials, model)
     rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
     known = dict.fromkeys((*SIGNALS, "motor_effort", *(s for t in trials for s in t.signals)))
     present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
@@ -137,6 +142,10 @@ def prepare(
         notes.append(
             "no encoder position is recorded: sensor offsets, slack and backlash cannot be told apart"
         )
+    for signal in present:
+        where = [trial.name for trial in trials if signal in trial.signals]
+        if len(where) < len(trials):
+            notes.append(f"{signal} is recorded only in {', '.join(where)}")
     few = [c for c in features.conditions if all(b.n < 5 for b in features.blocks if b.condition == c)]
     if few:
         notes.append(

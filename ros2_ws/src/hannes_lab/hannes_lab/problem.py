@@ -7,8 +7,8 @@ encoder zero ...), whose sensitivities are known, so that 13 closures are enough
     C_c = (diag(v) + J_c S J_c^T) / n        per condition c; v smoothed sample variance, S = diag(scatter variances)
 
 Where the model's form is not exactly that of the machine (a real hand, another simulator) its own error is added, which
-does not average out over the closures: a smooth random curve of the width `rig.own_error` (Kennedy, O'Hagan 2001, with a
-fixed width).
+does not average out over the closures: a smooth random curve of the width `rig.own_error` (Kennedy, O'Hagan 2001, with
+a fixed width).
 
 Whitened residual: L_c^{-1} (measured - predicted), C_c = L_c L_c^T.
 """
@@ -231,7 +231,7 @@ def build_problem(
             break
 
     whitener = []
-    discrepancy = []
+    discrepancy: list[tuple[NDArray[np.int64], Array]] = []
     for condition in features.conditions:
         own = [k for k, block in enumerate(features.blocks) if block.condition == condition]
         n = features.blocks[own[0]].n
@@ -257,11 +257,9 @@ def build_problem(
                 own_error = _own_error([features.blocks[k] for k in own], rig)
                 if own_error.any():
                     covariance = covariance + own_error
-                    discrepancy.append((rows, np.linalg.cholesky(own_error)))
+                    discrepancy.append((rows, np.asarray(np.linalg.cholesky(own_error), dtype=np.float64)))
             whitener.append((rows, np.linalg.cholesky(covariance)))
-    return Problem(
-        rig, features, tuple(whitener), tuple(deviations), counts or Counts(), tuple(discrepancy)
-    )
+    return Problem(rig, features, tuple(whitener), tuple(deviations), counts or Counts(), tuple(discrepancy))
 
 
 def _own_error(blocks: Sequence[Block], rig: Rig) -> Array:

@@ -17,6 +17,8 @@ from hannes_bags.recording import Recording
 from hannes_description.errors import HannesError
 from numpy.typing import NDArray
 
+from .units import in_si
+
 Array = NDArray[np.float64]
 
 SIGNALS = ("encoder_position", "motor_current", "motor_voltage", "grip_force")
@@ -33,8 +35,12 @@ UNITS = {
 
 ZERO_ORDER_HOLD_RATE = 90.0
 STRANGE_HOLD_RATE = 225.0
-"""Hz; a reference logged at least this fast is what the controller received, message by message; a slower log has gaps that
-are filled by a smooth curve.  The second is for recordings that do not say how they were logged."""
+"""Hz; a reference logged at least this fast is what the controller received, message by message; a slower log has gaps
+that are filled by a smooth curve.  The second is for recordings that do not say how they were logged."""
+
+
+LONGEST_GAP = 5.0
+"""Steps of a signal without a sample that are bridged by interpolation."""
 
 
 @dataclass(frozen=True)
@@ -235,10 +241,16 @@ def _change(shape: Array, ticks: float) -> float:
 
 
 def make_trial(
-    recording: Recording, *, name: str | None = None, period: float = 1e-3, signals: Sequence[str] = SIGNALS
+    recording: Recording,
+    *,
+    name: str | None = None,
+    period: float = 1e-3,
+    signals: Sequence[str] = SIGNALS,
+    scale: Mapping[str, float] | None = None,
 ) -> Trial:
     """A trial from a recording; the condition's name and options come from its metadata where it has them.
 
+    scale   factors to SI by signal name, where the recording is in other units
     Raises HannesError where the recording has no reference or none of the signals.
     """
     recording.require(["reference_position"])
@@ -250,33 +262,42 @@ def make_trial(
             f"{recording.source}: none of the signals {', '.join(signals)} is recorded; nothing can be "
             "compared."
         )
-    notes = list(recording.warnings)
+    # Units are said below, with what was done.
+    notes = [w for w in recording.warnings if "which looks like" not in w]
     meta = recording.metadata
     name = name or str(meta.get("condition") or _stem(recording.source))
     channel = recording["reference_position"]
     origin = float(channel.time[0])
     origin = math.floor(origin / period + 1e-6) * period
     duration = max(float(recording[s].time[-1]) for s in ("reference_position", *present)) - origin
+    samples, said = in_si(
+        {
+            s: (np.asarray(recording[s].time) - origin, np.asarray(recording[s].values, dtype=float))
+            for s in ("reference_position", *present)
+        },
+        scale or {},
+        recording.source,
+    )
+    notes += said
     reference, note = reference_on_grid(
-        channel.time - origin,
-        np.asarray(channel.values, dtype=float),
+        *samples.pop("reference_position"),
         period,
         duration,
         ZERO_ORDER_HOLD_RATE if "sensors" in meta else STRANGE_HOLD_RATE,
     )
     if note:
         notes.append(note)
-    samples = {
-        s: (np.asarray(recording[s].time) - origin, np.asarray(recording[s].values, dtype=float))
-        for s in present
-    }
     begin = max(float(t[0]) for t, _ in samples.values())
     end = min(float(t[-1]) for t, _ in samples.values())
     spans = find_closures(reference, period)
-    whole = [(a, min(b, end)) for a, b in spans if a >= begin - 0.1 and b > a]
+    inside = [(a, min(b, end)) for a, b in spans if a >= begin - 0.1 and min(b, end) > a]
+    whole = [span for span in inside if not any(_gap(time, *span) for time, _ in samples.values())]
+    if len(whole) < len(inside):
+        notes.append(f"{len(inside) - len(whole)} closures in which samples are missing are left out")
     closures = group_closures(reference, period, whole, name, channel.period)
-    if spans and len(closures) < len(spans):
-        notes.append(f"{len(spans) - len(closures)} of {len(spans)} closures are cut off and left out")
+    cut = len(spans) - len(closures) - (len(inside) - len(whole))
+    if cut:
+        notes.append(f"{cut} of {len(spans)} closures are cut off and left out")
     options = {key: meta[key] for key in ("object", "sensors", "pose", "encoder_session") if key in meta}
     return Trial(
         name,
@@ -289,6 +310,12 @@ def make_trial(
         recording.sha256,
         tuple(notes),
     )
+
+
+def _gap(time: Array, start: float, stop: float) -> bool:
+    """True where a signal has no sample for longer than a few of its steps, and long enough to hide something."""
+    steps = np.diff(time[(time >= start) & (time <= stop)])
+    return not steps.size or float(steps.max()) > max(LONGEST_GAP * float(np.median(np.diff(time))), 0.05)
 
 
 def _stem(source: str) -> str:

@@ -1,0 +1,141 @@
+"""Was something grasped, and about how stiff and where?  Read from the closures where nobody said so.
+
+While closing, an object adds a force that grows from one position on; no closure on nothing shows it there.  So the
+drive current against position is compared with that of the other recordings of the set, or, where none of them comes
+so far, with the nominal hand's.  A glove or a tight spring is there in all recordings, and is no object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from hannes_description.model import Model
+from hannes_sim.objects import GraspObject
+from numpy.typing import NDArray
+
+from .trials import Trial
+
+Array = NDArray[np.float64]
+
+FREE_TRAVEL = 0.2
+"""Part of the way in which the motor starts up: its current says nothing of an object."""
+
+EXCESS = (1.5, 0.05)
+EXCESS_OVER_NOMINAL = 2.0
+"""An object is seen where the current exceeds this multiple of what moves the free hand at the same place, by this much
+(A).  The nominal hand's current is less to be trusted than that of another recording of the same hand."""
+
+STIFFER = 3.0
+"""An object is stiffer than this multiple of the hand's own springs."""
+
+RISE = (0.3, 0.8)
+"""Parts of the excess between which its slope is taken."""
+
+
+def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
+    """The trials, with an object of roughly seen stiffness and place where nobody said what was grasped.
+
+    A kind that was named (soft, rigid) without a description of the recording says that there is an object, not how
+    stiff this one is: it gets the seen values too, where it is seen.
+    """
+    curves = [closing_curve(trial, model) for trial in trials]
+    out = []
+    for k, trial in enumerate(trials):
+        given = trial.options.get("object")
+        free = "object" not in trial.options or (isinstance(given, str) and given != "none")
+        if not free or ("object" in trial.options and "sensors" in trial.options):
+            out.append(trial)
+            continue
+        seen = _seen(curves[k], [c for j, c in enumerate(curves) if j != k], _nominal(model))
+        if seen is None:
+            out.append(trial)
+            continue
+        stiffness, place = seen
+        travel, opening = (model.parameters.value(f"hand.{n}") for n in ("fingertip_travel", "opening"))
+        grasp = GraspObject(size=max(opening - place * travel, 1e-3), stiffness=stiffness / travel**2)
+        said = (
+            "its stiffness and place are"
+            if given
+            else "that something was grasped, its stiffness and place are"
+        )
+        note = (
+            f"{said} read from the closures (about {grasp.stiffness:.2g} N/m from {place:.1f} rad on) and fitted; say "
+            f"--object {trial.name}=none if nothing was"
+        )
+        options = {**trial.options, "object": grasp.to_dict(), "object_seen": True}
+        out.append(replace(trial, options=options, notes=(*trial.notes, note)))
+    return out
+
+
+def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:
+    """Encoder position (p,) rad, increasing, and current (p,) A of the mean closing; None without an encoder.
+
+    Without a current, that which the nominal controller would ask for if the hand stood still.
+    """
+    if "encoder_position" not in trial.signals:
+        return None
+    closures = trial.of(trial.conditions[0])
+    length = min(c.stop - c.start for c in closures)
+    phase = np.linspace(0.0, length, 400)
+    position = _mean(trial, "encoder_position", phase)
+    if "motor_current" in trial.signals:
+        current = _mean(trial, "motor_current", phase)
+    else:
+        kp, kd = (model.parameters.value(f"control.{n}") for n in ("kp", "damping"))
+        ticks = np.arange(trial.reference.size) * trial.period
+        reference = np.mean([np.interp(c.start + phase, ticks, trial.reference) for c in closures], axis=0)
+        current = np.convolve(
+            kp * (reference - position) - kd * np.gradient(position, phase), np.ones(9) / 9.0, "same"
+        )
+    top = int(np.argmax(position))
+    rising = np.flatnonzero(position[: top + 1] > FREE_TRAVEL * position[top])
+    if rising.size < 8:
+        return None
+    q = np.maximum.accumulate(position[rising[0] : top + 1])
+    return q, current[rising[0] : top + 1]
+
+
+def _mean(trial: Trial, signal: str, phase: Array) -> Array:
+    time, values = trial.signals[signal]
+    closures = trial.of(trial.conditions[0])
+    return np.asarray(np.mean([np.interp(c.start + phase, time, values) for c in closures], axis=0))
+
+
+def _nominal(model: Model) -> tuple[float, float, float]:
+    """Torque of the free hand when closing slowly: at rest (N.m), per rad; and torque per ampere, at the pulley."""
+    value = model.parameters.value
+    still = value("friction.coulomb") + value("hand.coulomb") + value("hand.preload")
+    return still, value("hand.stiffness"), value("motor.kt") * value("gear.ratio") * value("gear.efficiency")
+
+
+def _seen(
+    own: tuple[Array, Array] | None,
+    others: Sequence[tuple[Array, Array] | None],
+    nominal: tuple[float, float, float],
+) -> tuple[float, float] | None:
+    """Stiffness at the pulley (N.m/rad) and place (rad) of what a closing curve shows more than the others."""
+    if own is None:
+        return None
+    q, current = own
+    still, rate, per_ampere = nominal
+    free = (still + rate * q) / per_ampere
+    peak = int(np.argmax(current))
+    factor, base = EXCESS_OVER_NOMINAL, free
+    for other in others:
+        if other is None or other[0][-1] < q[peak]:
+            continue
+        there = np.interp(q, *other)
+        if factor > EXCESS[0] or there[peak] < base[peak]:
+            factor, base = EXCESS[0], there
+    if current[peak] < factor * base[peak] + EXCESS[1]:
+        return None
+    excess = np.maximum.accumulate(np.maximum(current - base, 0.0)[: peak + 1])
+    first, last = (int(np.searchsorted(excess, part * excess[-1])) for part in RISE)
+    run = max(float(q[last] - q[first]), 1e-3)
+    slope = max(float(excess[last] - excess[first]), 1e-6) / run
+    place = float(q[first]) - float(excess[first]) / slope
+    if slope * per_ampere < STIFFER * rate or place < FREE_TRAVEL * q[-1]:
+        return None
+    return float(np.clip(slope * per_ampere, 1e-3, 5.0)), max(place, 0.0)

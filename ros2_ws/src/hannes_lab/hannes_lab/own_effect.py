@@ -1,0 +1,104 @@
+"""A user's own effect file is tried in a process of its own before the lab works with it.
+
+Compiled code that never returns cannot be interrupted, and one NaN spoils a fit without a word.  So the file is
+imported, compiled and simulated once with its typical values where a time limit can end it.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterable
+from multiprocessing.connection import Connection
+
+import numpy as np
+from hannes_description.errors import HannesError
+from hannes_sim.effect import EffectType, load_effect
+from hannes_sim.ports import DT, N_INPUTS, N_OUTPUTS, QL, VL, Q, T, V
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+TIME_LIMIT = 60.0
+"""s; import and compilation take a few, a closure milliseconds (on the MuJoCo plant a few seconds)."""
+
+Simulate = Callable[[str], None]
+
+
+def check_own_effects(
+    sources: Iterable[str], simulate: Simulate, motion: tuple[Array, Array], *, limit: float = TIME_LIMIT
+) -> None:
+    """Try every source that is a file (path.py:Class); names of the catalogue are passed over.
+
+    simulate  loads the effect and runs a closure with it; raises HannesError
+    motion    time (n,) s and position (n,) of a closure: where the effect must give numbers
+    Raises one HannesError that says what is wrong with the effect.
+    """
+    for source in sources:
+        if ":" in source:
+            _check(source, simulate, motion, limit)
+
+
+def _check(source: str, simulate: Simulate, motion: tuple[Array, Array], limit: float) -> None:
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe(duplex=False)
+    process = context.Process(target=_try, args=(source, simulate, motion, there), daemon=True)
+    process.start()
+    there.close()
+    try:
+        answer = here.recv() if here.poll(limit) else None
+    except EOFError:
+        answer = f"'{source}' ended the process that tried it: its contribute(x, p, s, y) writes outside its arrays."
+    finally:
+        if process.is_alive():
+            process.join(1.0)
+        if process.is_alive():
+            process.kill()
+        process.join()
+        here.close()
+    if answer is None:
+        raise HannesError(
+            f"'{source}' did not finish one closure within {limit:.0f} s: the file or its contribute(x, p, s, y) has a "
+            "loop that does not end."
+        )
+    if answer:
+        raise HannesError(answer)
+
+
+def _try(source: str, simulate: Simulate, motion: tuple[Array, Array], answer: Connection) -> None:
+    said = ""
+    try:
+        said = _without_number(load_effect(source), source, *motion)
+    except HannesError as error:
+        said = str(error)
+    if not said:
+        try:
+            simulate(source)
+        except HannesError as error:
+            said = f"'{source}' with its typical values: {error} Is the typical value too strong?"
+    answer.send(said)
+    answer.close()
+
+
+def _without_number(kind: EffectType, source: str, time: Array, position: Array) -> str:
+    """A sentence if contribute gives NaN, infinity or an error along a motion; "" if it gives numbers.
+
+    Compiled, a NaN may vanish in a limiter and the effect would silently do nothing.
+    """
+    x, s, y = np.zeros(N_INPUTS), np.zeros(max(kind.states, 1)), np.zeros(N_OUTPUTS)
+    p = np.array([parameter.typical for parameter in kind.parameters])
+    velocity = np.gradient(position, time)
+    x[DT] = float(np.median(np.diff(time)))
+    for t, q, v in zip(time, position, velocity, strict=True):
+        x[T], x[Q], x[QL], x[V], x[VL] = t, q, q, v, v
+        y[:] = 0.0
+        try:
+            kind.contribute(x, p, s, y)
+            wrong = "" if np.isfinite(y).all() and np.isfinite(s).all() else "NaN or infinity"
+        except (ArithmeticError, ValueError, IndexError) as error:
+            wrong = f"no number ({error})"
+        if wrong:
+            return (
+                f"'{source}': contribute(x, p, s, y) gives {wrong} at position {q:.4g}, velocity {v:.4g} with its "
+                "typical parameters. It must give finite numbers wherever the machine moves."
+            )
+    return ""

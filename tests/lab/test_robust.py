@@ -1,0 +1,193 @@
+"""Damaged and odd recordings, as a user meets them: worked through and said, or one clear error; never silently wrong."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hannes_description.joints import RAD_PER_COUNT
+from lab.foreign_bags import Damage, Signals, hannes, signals_of_set, write_bag, write_set
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+
+@pytest.fixture(scope="module")
+def good() -> dict[str, Signals]:
+    return signals_of_set()
+
+
+@pytest.fixture(scope="module")
+def slow(good: dict[str, Signals]) -> dict[str, Signals]:
+    return {"slow": good["slow"]}
+
+
+def scaled(**factors: float) -> Damage:
+    def damage(signals: Signals) -> Signals:
+        return {n: (t, v * factors.get(n, 1.0)) for n, (t, v) in signals.items()}
+
+    return damage
+
+
+def cut(begin: float, end: float, *only: str) -> Damage:
+    """Keep what lies more than `begin` s after the start and `end` s before the end."""
+
+    def damage(signals: Signals) -> Signals:
+        out = {}
+        for n, (t, v) in signals.items():
+            keep = (t >= begin) & (t <= t[-1] - end) if not only or n in only else np.ones(t.size, dtype=bool)
+            out[n] = (t[keep], v[keep])
+        return out
+
+    return damage
+
+
+def without(name: str) -> Damage:
+    return lambda signals: {n: pair for n, pair in signals.items() if n != name}
+
+
+def hole(signals: Signals) -> Signals:
+    t, v = signals["encoder_position"]
+    keep = (t < 6.0) | (t > 7.0)
+    return {**signals, "encoder_position": (t[keep], v[keep])}
+
+
+def holes_of_nan(signals: Signals) -> Signals:
+    signals["motor_current"][1][40:42] = np.nan
+    signals["encoder_position"][1][10] = np.inf
+    return signals
+
+
+def all_nan(signals: Signals) -> Signals:
+    signals["motor_current"][1][:] = np.nan
+    return signals
+
+
+def pushed(signals: Signals) -> Signals:
+    t, v = signals["encoder_position"]
+    v[(t > 8.8) & (t < 10.0)] += 3.0
+    return signals
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (cut(1.7, 2.2), "2 of 5 closures are cut off"),
+        (cut(0.0, 10.0, "motor_current"), "closures are cut off"),
+        (hole, "1 closures in which samples are missing are left out"),
+        (pushed, "1 closure(s) far from the others are left out"),
+        (without("motor_current"), "no current is recorded"),
+        (without("encoder_position"), "no encoder position is recorded"),
+        (holes_of_nan, "2 of 615 samples of motor_current are not finite"),
+        (all_nan, "no current is recorded"),
+        (scaled(encoder_position=180.0 / math.pi), "looks like degrees"),
+        (
+            scaled(encoder_position=1.0 / RAD_PER_COUNT, reference_position=1.0 / RAD_PER_COUNT),
+            "encoder counts",
+        ),
+        (scaled(motor_current=1000.0), "motor_current was multiplied by 0.001"),
+    ],
+)
+def test_it_works_through_and_says_so(
+    damage: Damage,
+    said: str,
+    slow: dict[str, Signals],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bags = write_set(tmp_path / "bags", slow, damage)
+    code, out, err = hannes("compare", str(bags), "--fitted", capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0, err
+    assert said in out
+    assert float(out.split("Overall error: ")[1].split()[0]) < 5.0
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (without("reference_position"), "reference_position"),
+        (scaled(encoder_position=3.8), "at another shaft"),
+        (scaled(encoder_position=-1.0), "--scale encoder_position=-1"),
+        (cut(1.7, 17.0), "no closure was found"),
+    ],
+)
+def test_what_cannot_be_used_is_one_clear_error(
+    damage: Damage,
+    said: str,
+    slow: dict[str, Signals],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bags = write_set(tmp_path / "bags", slow, damage)
+    for command in (("compare",), ("diagnose",), ("add", "--effect", "wire_slack"), ("report",)):
+        code, _, err = hannes(command[0], str(bags), *command[1:], capsys=capsys, monkeypatch=monkeypatch)
+        assert code == 2 and said in err and len(err.strip().splitlines()) == 1
+
+
+def test_a_factor_of_ones_own(
+    slow: dict[str, Signals],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bags = write_set(tmp_path / "bags", slow, scaled(encoder_position=-3.8))
+    words = ("compare", str(bags), "--fitted", "--scale", f"encoder_position={-1 / 3.8}")
+    code, out, _ = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and "as --scale says" in out
+    for wrong, said in (("encoder_position=x", "a number"), ("encoder=2", "unknown signal")):
+        code, _, err = hannes("compare", str(bags), "--scale", wrong, capsys=capsys, monkeypatch=monkeypatch)
+        assert code == 2 and said in err
+
+
+@pytest.mark.parametrize("clock", [1234.5, -0.06, 0.06])
+def test_stamps_of_another_clock(
+    clock: float,
+    slow: dict[str, Signals],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bags = write_set(tmp_path / "bags", slow, clock=clock)
+    code, out, _ = hannes("compare", str(bags), "--fitted", capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and "different clocks" in out
+    assert float(out.split("Overall error: ")[1].split()[0]) < 5.0
+
+
+def test_different_rates_and_storages_in_one_set(
+    good: dict[str, Signals],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fast = signals_of_set(sensors="bench", conditions=("fast",))["fast"]
+    write_bag(tmp_path / "slow", good["slow"])
+    write_bag(tmp_path / "fast", fast, sqlite=True)
+    code, out, _ = hannes("compare", str(tmp_path), "--fitted", capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and float(out.split("Overall error: ")[1].split()[0]) < 6.0
+    assert "motor_voltage is recorded only in fast" in out
+
+
+def test_empty_bags(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, plugin in (("mcap", StoragePlugin.MCAP), ("sqlite", StoragePlugin.SQLITE3)):
+        with Writer(tmp_path / name, version=9, storage_plugin=plugin):
+            pass
+        code, _, err = hannes("compare", str(tmp_path / name), capsys=capsys, monkeypatch=monkeypatch)
+        assert code == 2 and "holds no message" in err
+    (tmp_path / "zero").mkdir()
+    (tmp_path / "zero" / "zero.mcap").write_bytes(b"")
+    for path in ("zero", "zero/zero.mcap"):
+        code, _, err = hannes("compare", str(tmp_path / path), capsys=capsys, monkeypatch=monkeypatch)
+        assert code == 2 and "hannes recover" in err
+
+
+def test_hide_lists_its_conditions(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hannes_lab.hide import CONDITIONS
+
+    _, out, _ = hannes("hide", "--help", capsys=capsys, monkeypatch=monkeypatch)
+    assert all(name in out for name in CONDITIONS)
