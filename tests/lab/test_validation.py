@@ -9,10 +9,20 @@ import pytest
 from hannes_description.errors import HannesError
 from hannes_description.joints import DIGITS, FINGERS
 from hannes_description.model import Model
-from hannes_lab.validation import convergence, currents, double_pendulum, fitting, least_force
+from hannes_description.parameters import read_yaml
+from hannes_lab.validation import (
+    convergence,
+    currents,
+    double_pendulum,
+    fitting,
+    hypotheses,
+    least_force,
+    runtime,
+)
 from hannes_lab.validation.cli import run as run_rows
 from hannes_lab.validation.double_pendulum import Pendulum
 from hannes_lab.validation.table import Figure, Section, markdown
+from hannes_sim.mujoco_plant import MujocoPlant
 from scipy.signal import medfilt
 
 HAND = Model.load("thesis_hand")
@@ -127,3 +137,40 @@ def test_a_row_by_itself_and_an_unknown_one() -> None:
     assert {f.name.split()[0] for f in section.figures} >= set(FINGERS)
     with pytest.raises(HannesError, match="R99"):
         run_rows(HAND, ["R99"])
+
+
+def test_every_law_that_r12_is_tried_with_can_be_fitted_and_applied() -> None:
+    for name, law in fitting.LAWS.items():
+        base = fitting.base_model(law=name)
+        free = fitting.coordinates(base, name)
+        own = [c.name for c in free if law.free is not None and c.name == law.free[0]]
+        assert len(own) == (law.free is not None)
+        assert len(free) <= len(fitting.targets_of(name))
+        hand = fitting.applied(base, dict.fromkeys(own, 2.0 * law.free[1]) if law.free else {}, name)
+        assert (hand.sha256 != base.sha256) and len(hand.effects) == (law.effect is not None)
+    with pytest.raises(HannesError, match="glue"):
+        fitting.base_model(law="glue")
+
+
+def test_the_kept_laws_are_those_of_the_fit() -> None:
+    kept = read_yaml(hypotheses.FILE, "laws of R12")
+    assert set(kept) == set(hypotheses.OTHERS)
+    for name, entry in kept.items():
+        names = {c.name for c in fitting.coordinates(fitting.base_model(law=name), name)}
+        assert set(entry["values"]) == names
+        assert entry["free"] == len(names) and entry["soft_stiffness"] > 0.0
+
+
+def test_dry_friction_of_a_joint_has_a_door() -> None:
+    plant = MujocoPlant(HAND)
+    plant.set_dry_friction({"index_mcp": 0.5})
+    plant.advance(0.0, 1)
+    assert plant.model.dof_frictionloss[plant.model.joint("index_mcp").dofadr[0]] == 0.5
+    for wrong in ({"index_toe": 0.1}, {"index_mcp": -0.1}, {"index_mcp": math.nan}):
+        with pytest.raises(HannesError, match="index"):
+            plant.set_dry_friction(wrong)
+
+
+def test_the_work_of_the_solver_is_counted() -> None:
+    rows, iterations = runtime.solver_work(HAND, None)
+    assert 13.0 < rows < 60.0 and 0.5 < iterations < 10.0

@@ -19,7 +19,18 @@ from rich.table import Table
 
 from ..calibrate import default_cache
 from ..cli import _finite, _Progress
-from . import columns, convergence, double_pendulum, fitting, least_force, pictures, runtime, variants
+from ..executor import interruptible
+from . import (
+    columns,
+    convergence,
+    double_pendulum,
+    fitting,
+    hypotheses,
+    least_force,
+    pictures,
+    runtime,
+    variants,
+)
 from .table import HEADINGS, Progress, Section, cells, markdown
 
 ROWS = tuple(f"R{k:02d}" for k in range(1, 17))
@@ -117,6 +128,7 @@ def _value(model: Model, name: str) -> float:
     return next(e.values[parameter] for e in model.effects if e.name == effect)
 
 
+@interruptible
 def validate(
     rows: Annotated[
         list[str] | None, typer.Option("--row", help="Only these rows (R01 .. R16, convergence).")
@@ -136,7 +148,14 @@ def validate(
     motor: Annotated[
         str, typer.Option(help="Motor of --calibrate: " + ", ".join(fitting.MOTORS) + ".")
     ] = "2642W012CR",
-    starts: Annotated[int, typer.Option(min=1, help="Starts of --calibrate.")] = 3,
+    laws: Annotated[
+        bool,
+        typer.Option(
+            "--laws",
+            help="Calibrate the other laws that R12 is tried with first; the page shows what they predict.",
+        ),
+    ] = False,
+    starts: Annotated[int, typer.Option(min=1, help="Starts of --calibrate and --laws.")] = 3,
     model_out: Annotated[
         Path | None, typer.Option("--model-out", help="Where --calibrate writes the model file.")
     ] = None,
@@ -145,6 +164,10 @@ def validate(
     """Hold the plant against the thesis, row by row; writes docs/validation.md and its pictures."""
     begin = time.monotonic()
     with _Progress(quiet=json) as progress:
+        if laws:
+            written = hypotheses.write(starts=starts, cache=default_cache(), progress=progress)
+            if not json:
+                typer.echo(f"Laws of R12: {written}")
         if calibrate:
             found = fitting.calibrate_thesis(
                 motor=motor, starts=starts, cache=default_cache(), progress=progress
@@ -152,7 +175,10 @@ def validate(
             chosen = found.model
             target = model_out or data_path("models", f"{chosen.name}.yaml")
             chosen.save(target)
+            model = chosen.name if model_out is None else str(model_out)
             if not json:
+                ends = ", ".join(f"{cost:.1f}" for cost in found.costs)
+                typer.echo(f"{found.agree} of {len(found.costs)} starts agree (costs {ends}).")
                 typer.echo(f"Model file: {target}")
         else:
             chosen = Model.load(model)
@@ -163,9 +189,7 @@ def validate(
             )
         sections = run(chosen, rows, progress)
     seconds = time.monotonic() - begin
-    command = "hannes validate" + (
-        f" --model {shlex.quote(model)}" if model != "thesis_hand" and not calibrate else ""
-    )
+    command = "hannes validate" + (f" --model {shlex.quote(model)}" if model != "thesis_hand" else "")
     files: list[Path] = []
     if rows is None:
         files = pictures.write(sections, out.parent / "figures")

@@ -41,12 +41,12 @@ class Figure:
     @property
     def thesis_error(self) -> float:
         """Relative error of the thesis' model, percent (P22: (desired - model) / desired x 100)."""
-        return _relative(self.desired, self.thesis) if self.kind == "value" else math.nan
+        return relative(self.desired, self.thesis) if self.kind == "value" else math.nan
 
     @property
     def error(self) -> float:
         """Relative error of this model, percent."""
-        return _relative(self.desired, self.ours) if self.kind == "value" else math.nan
+        return relative(self.desired, self.ours) if self.kind == "value" else math.nan
 
     @property
     def closer(self) -> bool | None:
@@ -110,7 +110,8 @@ class Section:
         }
 
 
-def _relative(desired: float, value: float) -> float:
+def relative(desired: float, value: float) -> float:
+    """Relative error in percent (P22); NaN where there is none."""
     if not (math.isfinite(desired) and math.isfinite(value)) or desired == 0.0:
         return math.nan
     return (desired - value) / desired * 100.0
