@@ -1,4 +1,4 @@
-"""Damaged and odd recordings, as a user meets them: worked through and said, or one clear error; never silently wrong."""
+"""Damaged and odd recordings, as a user meets them: worked through and said, or one clear error."""
 
 from __future__ import annotations
 

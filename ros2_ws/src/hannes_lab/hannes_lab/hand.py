@@ -42,6 +42,9 @@ _UNKNOWN_GAINS = {
 """Gains of a controller that nobody described, with the widths of their priors (of the logarithm): the outer loop shows
 in the static error; of the inner one the thesis gives the order of magnitude."""
 
+WIDE_STEP = 0.1
+"""Step of finite differences where the prior is wide: half of its width leads past every bend of the signals."""
+
 _UNKNOWN_ZERO_SD = 0.05
 """rad; what a hand calls open whose homing nobody described."""
 
@@ -65,9 +68,10 @@ OWN_ERROR_DRIVE = 0.02
 """Of a signal's span: how far the form of the model may be from that of a hand that is not this simulator's.  The loop
 holds the position; what the model does not know shows in what drives it."""
 
+RESTING = 0.05
 AT_REST = 10.0
-"""How many times larger that is once the reference is back at rest: the hand lies against its open stop on a slack
-wire, of which nothing is known."""
+"""How many times larger that is while the reference is within this part of its span of its rest: the hand lies against
+its open stop on a slack wire, of which nothing is known."""
 
 REFERENCE_LEAD = "log.reference_lead"
 LEAD_SEEN = 0.02
@@ -157,11 +161,14 @@ class HandRig(PlantRig):
                     plant, _, _ = self._plant(model.without_effects(), trial)
                     known = is_described(trial) and not trial.options.get("object_seen")
                     width = sd if known else _UNKNOWN_OBJECT_SD[name]
-                    out.append(Nuisance(f"{name}@{trial.name}", plant.get(name), width, relative, scatter))
+                    step = 0.5 if known else WIDE_STEP
+                    place = f"{name}@{trial.name}"
+                    out.append(Nuisance(place, plant.get(name), width, relative, scatter, step=step))
                     damping = "object.damping"
                     if name == "object.stiffness" and not known and damping in plant.names:
+                        place = f"{damping}@{trial.name}"
                         out.append(
-                            Nuisance(f"{damping}@{trial.name}", plant.get(damping), _UNKNOWN_DAMPING_SD, True)
+                            Nuisance(place, plant.get(damping), _UNKNOWN_DAMPING_SD, True, step=WIDE_STEP)
                         )
             elif name == "encoder.zero":
                 out += [
@@ -172,12 +179,13 @@ class HandRig(PlantRig):
                         False,
                         scatter,
                         "rad",
+                        step=0.5 if is_described(trial) else WIDE_STEP,
                     )
                     for trial in self.trials
                 ]
             elif model.parameters.value(name) > 0.0:
                 out.append(self._nuisance(name, entry, model))
-        return out + self._bench_nuisances(model)
+        return out + [replace(n, step=WIDE_STEP) for n in self._bench_nuisances(model)]
 
     def _bench_nuisances(self, model: Model) -> list[Nuisance]:
         """What is unknown of controller and logger where a recording does not describe them."""
@@ -221,9 +229,8 @@ class HandRig(PlantRig):
         closure = trial.of(block.condition)[0]
         ticks = np.arange(trial.reference.size) * trial.period
         reference = np.interp(closure.start + block.phase, ticks, trial.reference)
-        away = np.abs(reference - reference[-1]) > 0.02 * float(np.ptp(reference))
-        if away.any():
-            sd[int(np.flatnonzero(away)[-1]) + 1 :] *= AT_REST
+        rest = float(np.median(trial.reference[[0, -1]]))
+        sd[np.abs(reference - rest) < RESTING * float(np.ptp(trial.reference))] *= AT_REST
         return sd
 
     def plant(self, model: Model, trial: Trial) -> Plant:

@@ -92,7 +92,15 @@ class Coordinate:
 def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
     """z in standard deviations of the prior; a step of half of one is well above the simulation's own roughness."""
     return Coordinate(
-        nuisance.name, nuisance.mean, nuisance.sd, nuisance.log, -np.inf, np.inf, True, 0.5, nuisance.unit
+        nuisance.name,
+        nuisance.mean,
+        nuisance.sd,
+        nuisance.log,
+        -np.inf,
+        np.inf,
+        True,
+        nuisance.step,
+        nuisance.unit,
     )
 
 

@@ -51,6 +51,7 @@ class Nuisance:
     sd           standard deviation of the prior, in the parameter's unit, or of its logarithm if `log`
     log          positive parameter, treated on a logarithmic scale
     closure_sd   scatter from closure to closure, same scale as sd
+    step         of finite differences, in sd: small where the prior is wide
     """
 
     name: str
@@ -59,6 +60,7 @@ class Nuisance:
     log: bool
     closure_sd: float = 0.0
     unit: str = ""
+    step: float = 0.5
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.sd) and self.sd > 0.0):
