@@ -21,6 +21,7 @@ from hannes_stiffness.models import (
     TrainingData,
     TreeSettings,
     apply_rules,
+    class_weights,
     cross_validate,
     fit,
     fit_estimator,
@@ -159,7 +160,7 @@ def edit(copy, change):
         (lambda m: m.update(features=[1, 2]), "features"),
         (lambda m: m.update(classes=["void", "soft", "rigid"]), "classes"),
         (lambda m: m.update(feature_names=["a", "b", "c"]), "names the features"),
-        (lambda m: m["features"].update(version="window/1"), "names the features"),
+        (lambda m: m["features"].update(version="window/2"), "names the features"),
         (lambda m: m.update(sure=2.0), "sure"),
         (lambda m: m.pop("sure"), "sure"),
         (lambda m: m.update(calibration={"weights": [[1]], "bias": [0]}), "calibration"),
@@ -328,8 +329,14 @@ def test_every_method_on_windows_learns_and_converts(method, tmp_path):
     never = np.zeros(len(data.values), bool)
     answers = StiffnessClassifier.load(path).answer(data.values, never)
     np.testing.assert_allclose(answers.probabilities, model.predict_proba(data.values), atol=2e-4)
-    assert (answers.classes == data.labels).mean() > 0.9
+    assert (answers.classes == data.labels).mean() > 0.85
     assert np.isnan(answers.stiffness).all()
+
+
+def test_rigid_and_soft_weigh_alike_and_void_as_often_as_it_comes():
+    labels = np.array([0] * 5 + [1] * 10 + [2] * 30)
+    weight = class_weights(labels)
+    np.testing.assert_allclose([weight[labels == k].sum() for k in range(3)], [5.0, 20.0, 20.0])
 
 
 def test_weighted_quantile():

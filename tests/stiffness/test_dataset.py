@@ -8,6 +8,7 @@ from hannes_bags.recording import Channel, Recording
 from hannes_bags.writing import write_recording
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_sim.effect import strength_of
 from hannes_sim.objects import RIGID_DYNAMOMETER, SOFT_BALL, GraspObject
 from hannes_stiffness.classifier import StiffnessClassifier
 from hannes_stiffness.cli import app
@@ -22,6 +23,7 @@ from hannes_stiffness.dataset import (
     kind_of,
     label,
     make_dataset,
+    merge,
 )
 from hannes_stiffness.evaluation import answer, kind_name, scores_of
 from hannes_stiffness.features import WINDOW, FeatureSpec, extract
@@ -124,6 +126,19 @@ def test_a_broken_data_set_is_refused(content, tmp_path):
         Dataset.load(tmp_path)
 
 
+def test_sets_train_together_and_their_objects_and_hands_stay_apart(small):
+    other = make_dataset(draw_scenes(9, 2, hands=3), MODEL, seed=2)
+    both = merge([small, other])
+    assert merge([small]) is small
+    assert len(both.closures) == len(small.closures) + 9
+    a, b = (d.training_data(FeatureSpec()) for d in (small, both))
+    np.testing.assert_array_equal(b.values[: len(a.values)], a.values)
+    assert not set(b.hands[: len(a.values)]) & set(b.hands[len(a.values) :])
+    assert len(both.manifest["sets"]) == 2
+    with pytest.raises(HannesError, match="no data set"):
+        merge([])
+
+
 def test_wide_scenes_range_over_what_they_should():
     wide = VARIETIES["wide"]
     scenes = draw_scenes(600, 1, hands=50, variety="wide", objects=200)
@@ -155,6 +170,22 @@ def test_varied_hands_have_hidden_effects():
     assert {len(h.effects) for h in hands} == {0, 1, 2, 3}
     assert hand_of(MODEL, 5, 1, varied=True).sha256 == hands[4].sha256
     assert hand_of(MODEL, 0, 1, varied=True) is MODEL
+
+
+def test_a_hidden_effect_adds_to_what_the_model_has_of_it():
+    own = MODEL.with_effect(strength_of("load_dependent_friction", 5.0))
+
+    def friction(model, hand):
+        found = [
+            e for e in hand_of(model, hand, 1, varied=True).effects if e.name == "load_dependent_friction"
+        ]
+        return found[0].values["coefficient"] if found else 0.0
+
+    base = own.effects[0].values["coefficient"]
+    drawn = [(friction(MODEL, k), friction(own, k)) for k in range(1, 80)]
+    assert any(hidden for hidden, _ in drawn)
+    for hidden, both in drawn:
+        np.testing.assert_allclose(both, min(1.0, base + hidden))
 
 
 def test_hands_of_the_population_differ_within_their_bounds():
@@ -254,6 +285,9 @@ def test_a_classifier_on_windows_beats_chance_and_says_when_it_is_not_sure(windo
     answered = answer(classifier, other.closures)
     result = scores_of(answered, kind_name)
     assert result["hop_50ms"]["pooled"]["f1"] > 0.7
+    late = result["latency"]["pooled"]
+    # The first touch comes first, the grip that the motor feels after it.
+    assert late["from_contact_median_s"] > late["from_grip_median_s"] >= 0.0
     refused = result["not_sure"]
     assert 0.0 < refused["part"] < 0.9
     assert refused["right_when_sure"] > refused["right_if_forced"]

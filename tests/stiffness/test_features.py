@@ -195,6 +195,38 @@ def test_a_window_sees_slopes_and_the_grasp_its_line(slope):
     np.testing.assert_allclose(last["free_level"], 0.2, atol=0.03)
 
 
+@pytest.mark.parametrize(("spring", "damper"), [(0.06, 0.0), (0.06, 0.05), (0.5, 0.02)])
+def test_a_damper_is_told_from_a_spring_where_the_hand_slows_down(spring, damper):
+    from hannes_stiffness.window import SPRING, VISCOUS
+
+    spec = FeatureSpec(version=WINDOW, mask=0.0)
+    # Velocity falls from 10 rad/s to nearly nothing, as at the end of a half sine.
+    t = np.arange(40) / 30.0
+    q = 12.0 * np.sin(10.0 / 12.0 * t)
+    middle = t - 0.5 / 30.0  # an averaged current belongs to the middle of its step
+    v = 10.0 * np.cos(10.0 / 12.0 * middle)
+    x = np.maximum(0.0, q - 4.0)
+    i = 0.2 + VISCOUS * v + SPRING * q + spring * x + damper * v * (x > 0.0)
+    batch = extract(t, i, q + 0.5, q, spec)
+    last = dict(zip(spec.names, batch.values[-1], strict=True))
+    k, c = 0.01 * np.expm1(last["viscoelastic_stiffness"]), 0.01 * np.expm1(last["viscoelastic_damping"])
+    np.testing.assert_allclose(k, spring, rtol=0.15)
+    np.testing.assert_allclose(c, damper, atol=0.015)
+
+
+def test_what_rises_before_the_contact_is_expected_to_go_on():
+    from hannes_stiffness.window import VISCOUS
+
+    spec = FeatureSpec(version=WINDOW, mask=0.0)
+    t = np.arange(45) / 30.0
+    q = 10.0 * t
+    glove = 0.02  # A/rad more than the nominal springs need: slow enough for the free level to follow
+    i = 0.1 + VISCOUS * 10.0 + (0.0094 + glove) * q
+    last = dict(zip(spec.names, extract(t, i, q + 0.5, q, spec).values[-1], strict=True))
+    np.testing.assert_allclose(last["free_slope"], glove, rtol=0.1)
+    np.testing.assert_allclose(last["load_above_free_line"], 0.0, atol=0.02)
+
+
 def test_nothing_grasped_shows_no_contact():
     spec = FeatureSpec(version=WINDOW, mask=0.0)
     batch = extract(*grasp(0.0), spec)

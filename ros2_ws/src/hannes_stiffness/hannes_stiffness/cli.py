@@ -63,9 +63,9 @@ def dataset(
         Path, typer.Option(help="Folder of the bag set; given again, it goes on where it stopped.")
     ],
     seed: SeedOption = 1,
-    closures: ClosuresOption = 4000,
-    hands: HandsOption = 300,
-    objects: ObjectsOption = 600,
+    closures: ClosuresOption = 4800,
+    hands: HandsOption = 2400,
+    objects: ObjectsOption = 2400,
     variety: VarietyOption = "wide",
     model: ModelOption = _MODELS,
     jobs: JobsOption = 1,
@@ -93,7 +93,8 @@ def train(
     ],
     seed: SeedOption = 1,
     data: Annotated[
-        Path | None, typer.Option(help="Bag set of `dataset`; without it, closures are simulated.")
+        list[Path] | None,
+        typer.Option(help="Bag set of `dataset`, or several; without it, closures are simulated."),
     ] = None,
     method: Annotated[
         str,
@@ -109,6 +110,12 @@ def train(
     model: ModelOption = _MODELS,
     jobs: JobsOption = 1,
     current: Annotated[str, typer.Option(help="Current as the feature: rectified or signed.")] = "rectified",
+    void_current: Annotated[
+        float,
+        typer.Option(
+            help="A below which a sample is void by rule; 0: contact alone decides.", min=0.0, max=10.0
+        ),
+    ] = 0.3,
     trees: Annotated[int, typer.Option(help="Trees in the bag.", min=1, max=1000)] = 30,
     leaves: Annotated[int, typer.Option(help="Most leaves of a tree.", min=2, max=100_000)] = 256,
     folds: Annotated[int, typer.Option(help="Folds of the cross-validation.", min=2, max=100)] = 5,
@@ -119,13 +126,13 @@ def train(
 ) -> None:
     """Train a classifier with calibrated probabilities and an estimate of the stiffness, and store it."""
     from .classifier import StiffnessClassifier
-    from .dataset import Dataset
+    from .dataset import Dataset, merge
     from .models import TreeSettings
     from .training import train as train_classifier
 
     settings = TreeSettings(trees=trees, leaves=leaves, folds=folds)
     if data:
-        training = Dataset.load(data)
+        training = merge([Dataset.load(folder) for folder in data])
     else:
         training = _simulate("training", closures, seed, hands, model, jobs, variety, objects)
     count = max(60, len(training.closures) // 4) if held_out is None else held_out
@@ -134,8 +141,9 @@ def train(
         title = f"held_out, {Model.load(name).name}"
         others[title] = _simulate(title, count, seed + _HELD_OUT_SEED, hands, [name], jobs, variety)
     path = train_classifier(
-        training, out, seed=seed, method=method, current=current, settings=settings, held_out=others, say=_say
-    )
+        training, out, seed=seed, method=method, current=current, void_current=void_current, settings=settings,
+        held_out=others, say=_say,
+    )  # fmt: skip
     manifest = dict(StiffnessClassifier.load(path).manifest)
     _show({"file": str(path), **manifest}, as_json, lambda: _print_training(path, manifest))
 

@@ -16,7 +16,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -28,10 +28,10 @@ from hannes_bags.writing import write_recording
 from hannes_control.double_pid import DoublePID
 from hannes_control.reference import FULL_CLOSURE, PROFILES, make_profile
 from hannes_description.errors import HannesError
-from hannes_description.model import Model
+from hannes_description.model import EffectEntry, Model
 from hannes_description.parameters import data_path, read_yaml
 from hannes_description.signals import SIGNALS, STIFFNESS_CLASSES
-from hannes_sim.effect import catalogue, strength_of
+from hannes_sim.effect import catalogue, load_effect, strength_of
 from hannes_sim.factory import make_plant
 from hannes_sim.measurement import THESIS, Sensors
 from hannes_sim.objects import SOFT_BALL, GraspObject
@@ -306,7 +306,7 @@ def hand_of(model: Model, hand: int, seed: int, *, varied: bool = False) -> Mode
 
     The spreads are those of the shipped parameter file `population.yaml` (`hand_sd`), normally distributed and
     cut at the parameters' bounds. A varied hand has up to three effects of the catalogue at 0.3 to 2 times their
-    typical strength, of either sign where the effect has one.
+    typical strength, of either sign where the effect has one; one that the model itself has adds to it.
     """
     if hand == 0:
         return model
@@ -319,8 +319,24 @@ def hand_of(model: Model, hand: int, seed: int, *, varied: bool = False) -> Mode
     for name in rng.choice(names, size=int(rng.choice(4, p=(0.2, 0.3, 0.3, 0.2))), replace=False):
         sign = float(rng.choice((-1.0, 1.0))) if catalogue()[name].strength().lower < 0.0 else 1.0
         factor = float(np.exp(rng.uniform(math.log(0.3), math.log(2.0))))
-        model = model.with_effect(strength_of(str(name), sign * factor))
+        model = _with_hidden(model, strength_of(str(name), sign * factor))
     return model
+
+
+def _with_hidden(model: Model, hidden: EffectEntry) -> Model:
+    """The model with a further effect. What the model has of it already stays below: to replace a calibrated strength
+    by a draw around the typical one could take away more than it hides."""
+    own = next((e for e in model.effects if e.name == hidden.name), None)
+    if own is not None:
+        kind = load_effect(own.source or own.name)
+        values = dict(own.values)
+        for p in kind.parameters:
+            if p.vanishing is not None:
+                values[p.name] = min(
+                    max(values[p.name] + hidden.values[p.name] - p.vanishing, p.lower), p.upper
+                )
+        hidden = kind.entry(values, source=own.source)
+    return model.with_effect(hidden)
 
 
 def _scattered(model: Model, spread: str, rng: np.random.Generator) -> Model:
@@ -444,6 +460,30 @@ class Dataset:
             )
         closures = [closure for name in parts for closure in closures_of(read_bag(folder / str(name)))]
         return cls(tuple(closures), manifest)
+
+
+def merge(sets: Sequence[Dataset]) -> Dataset:
+    """Several sets as one to train on; objects and hands of different sets stay different."""
+    if not sets:
+        raise HannesError("There is no data set to train on.")
+    if len(sets) == 1:
+        return sets[0]
+    most = 1 + max(c.scene.hand for one in sets for c in one.closures)
+    closures = tuple(
+        replace(
+            c,
+            scene=replace(
+                c.scene,
+                object=c.scene.object if c.scene.grasp is None else f"{number}/{c.scene.object}",
+                hand=number * most + c.scene.hand,
+            ),
+        )
+        for number, one in enumerate(sets)
+        for c in one.closures
+    )
+    kinds = {kind: sum(c.scene.kind == kind for c in closures) for kind in STIFFNESS_CLASSES}
+    manifests = [{k: v for k, v in one.manifest.items() if k != "parts"} for one in sets]
+    return Dataset(closures, {"closures": len(closures), "kinds": kinds, "sets": manifests})
 
 
 def _read_manifest(folder: Path) -> dict[str, Any]:

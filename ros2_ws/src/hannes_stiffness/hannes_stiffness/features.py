@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from .window import WINDOW_NAMES, new_window_state, window_features, window_series
 
 SINGLE_SAMPLE = "single-sample/1"
-WINDOW = "window/1"
+WINDOW = "window/2"
 FEATURES: Mapping[str, tuple[str, ...]] = {
     SINGLE_SAMPLE: ("motor_current", "reference_position", "encoder_position"),
     WINDOW: WINDOW_NAMES,

@@ -47,6 +47,7 @@ def train(
     seed: int,
     method: str = THESIS_METHOD,
     current: str = "rectified",
+    void_current: float = 0.3,
     settings: TreeSettings | None = None,
     held_out: Mapping[str, Dataset] | None = None,
     say: Callable[[str], None] = lambda text: None,
@@ -54,8 +55,10 @@ def train(
     """Train on the data set, score by cross-validation and write `path` (.onnx) with its manifest.
 
     seed      of the models and of the folds
-    method    a name of METHODS, or "best": all are compared, and the best one on windows is taken
+    method    a name of METHODS, or "best": all are compared, and of those on windows the one with the best
+              window F1 is taken
     current   "rectified" or "signed"
+    void_current  a sample below it is void by rule, A (P19); 0: contact alone decides
     held_out  further data sets by name, none of whose closures was trained on; their scores go into the manifest
     say       told what is going on, one sentence at a time
 
@@ -64,7 +67,10 @@ def train(
     """
     settings = settings or TreeSettings()
     names = tuple(METHODS) if method == BEST else (method,)
-    specs = {name: FeatureSpec(current=current, version=method_of(name).features) for name in names}
+    specs = {
+        name: FeatureSpec(current=current, void_current=void_current, version=method_of(name).features)
+        for name in names
+    }
     data = {
         (spec.version, contact): dataset.training_data(spec, contact=contact)
         for spec in specs.values()
@@ -85,7 +91,8 @@ def train(
     chosen = names[0]
     if method == BEST:
         windows = [n for n in names if METHODS[n].features != SINGLE_SAMPLE]
-        chosen = min(windows, key=lambda n: sum(scores[n][g]["log_loss"] for g in COMPARED))
+        # Not the log loss: the probabilities are calibrated afterwards.
+        chosen = max(windows, key=lambda n: sum(scores[n][g]["overlap_50ms"]["f1"] for g in COMPARED))
     spec = specs[chosen]
     used = data[spec.version, method != THESIS_METHOD]
     say(f"Training {METHODS[chosen].title} on all of them.")

@@ -11,7 +11,8 @@ friction M is, and what the current was before the contact is M. So a closure ke
   that a closure's start is not taken for an object;
 - its contact, the last sample at which the load current was within `LIFT` of that level;
 - the line load current over encoder since the contact, while the encoder goes on closing (least squares), its steepest
-  parts, and how far the two have come.
+  parts, and how far the two have come; and the same with a damper beside the spring (Kelvin-Voigt);
+- the line load current over encoder before the contact, and how far the load current is above it now.
 
 A closure begins where the reference rises after it had fallen by `FALL` (a ripple is no new closure). Slopes are given
 as log(1 + x / scale) with the sign of x: they range over three decades.
@@ -59,6 +60,10 @@ WINDOW_NAMES = (
     "load_secant",
     "acceleration",
     "closing_time",
+    "viscoelastic_stiffness",
+    "viscoelastic_damping",
+    "free_slope",
+    "load_above_free_line",
 )
 """Currents A; angles rad at the pulley; velocities rad/s; times s; per-encoder figures and slopes as logarithms."""
 
@@ -78,13 +83,16 @@ _RISES, _RESTS = 0.5, 0.05
 """Rates of the reference, rad/s, above which it rises and below which it may rise again (hysteresis)."""
 _CLOSES = 0.3
 """Encoder velocity, rad/s, above which the hand closes."""
-_SLOPE, _RATIO = 0.2, 0.01
-"""Scales of the logarithms: A/s, A/rad."""
+_SLOPE, _RATIO, _DAMPING = 0.2, 0.01, 0.01
+"""Scales of the logarithms: A/s, A/rad, A s/rad."""
+_RIDGE_Q, _RIDGE_V, _RIDGE_FREE = 1e-3, 1e-2, 1.0
+"""What a sample adds to the squares of travel (rad2), velocity (rad2/s2) and free travel (rad2), so that a fit without
+spread gives nothing rather than anything."""
 
 # Places in the state
 _COUNT, _RISING, _PEAK, _ONSET, _FREE, _LOADED, _Q0, _I0, _T0, _V0, _STEEP, _STEEP_Q, _RISE, _TRAVEL, _N, _SQ, _SI, \
-    _SQQ, _SQI, _SEEN, _LOAD0, _LOAD_RISE = range(22)  # fmt: skip
-_RING = 22
+    _SQQ, _SQI, _SEEN, _LOAD0, _LOAD_RISE, _SZZ, _SQZ, _SZI, _FN, _FQ, _FI, _FQQ, _FQI = range(30)  # fmt: skip
+_RING = 30
 STATE = _RING + 4 * SAMPLES
 
 
@@ -202,6 +210,13 @@ def window_features(s: Any, t: float, i: float, r: float, q: float, mask: float,
             s[_Q0], s[_I0], s[_T0], s[_V0], s[_LOAD0] = q, abs(i), t, velocity, load
             s[_STEEP] = s[_STEEP_Q] = s[_RISE] = s[_TRAVEL] = s[_LOAD_RISE] = 0.0
             s[_N], s[_SQ], s[_SI], s[_SQQ], s[_SQI] = 1.0, 0.0, 0.0, 0.0, 0.0
+            s[_SZZ], s[_SQZ], s[_SZI] = 0.0, 0.0, 0.0
+            if velocity > _CLOSES:
+                s[_FN] += 1.0
+                s[_FQ] += q
+                s[_FI] += load
+                s[_FQQ] += q * q
+                s[_FQI] += q * load
         elif q - s[_Q0] >= s[_TRAVEL] or load - s[_LOAD0] > s[_LOAD_RISE]:
             s[_LOADED] = 1.0
             x, y = q - s[_Q0], load - s[_LOAD0]
@@ -214,9 +229,22 @@ def window_features(s: Any, t: float, i: float, r: float, q: float, mask: float,
             s[_SI] += y
             s[_SQQ] += x * x
             s[_SQI] += x * y
+            s[_SZZ] += speed * speed
+            s[_SQZ] += x * speed
+            s[_SZI] += speed * y
     number = max(s[_N], 1.0)
     spread = s[_SQQ] - s[_SQ] * s[_SQ] / number
     line = (s[_SQI] - s[_SQ] * s[_SI] / number) / max(spread, number * 1e-4)
+    # Spring and damper together, load = k travel + c velocity: a damped plush that is closed on fast feels rigid.
+    xx, zz = s[_SQQ] + _RIDGE_Q * number, s[_SZZ] + _RIDGE_V * number
+    determinant = xx * zz - s[_SQZ] * s[_SQZ]
+    spring = (s[_SQI] * zz - s[_SZI] * s[_SQZ]) / determinant
+    damper = (s[_SZI] * xx - s[_SQI] * s[_SQZ]) / determinant
+    # What the load current was on the way there, over the encoder: with a glove or a spring it rises without an object.
+    frees = max(s[_FN], 1.0)
+    mean_q, mean_load = s[_FQ] / frees, s[_FI] / frees
+    rise = (s[_FQI] - frees * mean_q * mean_load) / (s[_FQQ] - frees * mean_q * mean_q + _RIDGE_FREE * frees)
+    expected = mean_load + rise * (q - mean_q) if s[_FN] > 0.0 else load
     travel = q - s[_Q0] if s[_SEEN] > 0.0 else 0.0
     free = s[_FREE] if s[_SEEN] > 0.0 else load
     since = min(t - s[_T0], LONGEST) if s[_SEEN] > 0.0 else 0.0
@@ -236,6 +264,8 @@ def window_features(s: Any, t: float, i: float, r: float, q: float, mask: float,
     out[29] = _logarithm(s[_LOAD_RISE] / max(s[_TRAVEL], 0.02), _RATIO)
     out[30] = acceleration
     out[31] = min(t - s[_ONSET], 2.0 * LONGEST)
+    out[32], out[33] = _logarithm(spring, _RATIO), _logarithm(damper, _DAMPING)
+    out[34], out[35] = rise, load - expected
     return blind
 
 
