@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 from hannes_description.errors import HannesError
-from hannes_sim.effect import EffectType, load_effect
+from hannes_sim.effect import EffectType, compile_effect, load_effect
 from hannes_sim.ports import DT, N_INPUTS, N_OUTPUTS, QL, VL, Q, T, V
 from numpy.typing import NDArray
 
@@ -67,7 +67,10 @@ def _check(source: str, simulate: Simulate, motion: tuple[Array, Array], limit: 
 def _try(source: str, simulate: Simulate, motion: tuple[Array, Array], answer: Connection) -> None:
     said = ""
     try:
-        said = _without_number(load_effect(source), source, *motion)
+        kind = load_effect(source)
+        compile_effect(kind)
+        with np.errstate(all="ignore"):
+            said = _without_number(kind, source, *motion)
     except HannesError as error:
         said = str(error)
     if not said:

@@ -1,0 +1,98 @@
+"""A user's effect that hangs, gives NaN or is too strong: one clear error; what diverges in a fit is counted."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hannes_description.model import Model
+from hannes_lab.own_effect import check_own_effects
+from hannes_lab.prepare import prepare
+from hannes_lab.problem import FAILED
+from hannes_lab.trials import make_trial
+from lab.foreign_bags import Signals, hannes, signals_of_set, write_set
+
+EFFECT = '''
+import math
+
+from hannes_sim.effect import Effect, EffectParameter
+from hannes_sim.ports import FRICTION, TORQUE, Q, V
+
+
+class Mine(Effect):
+    """A test."""
+
+    name = "mine"
+    title = "mine"
+    parameters = (EffectParameter("level", "N.m", lower=0.0, upper=10.0, typical={typical}, vanishing=0.0),)
+    looks_like = "nothing"
+
+    @staticmethod
+    def contribute(x, p, s, y):
+        {body}
+'''
+HANG = "k = 0.0\n        while k < 1.0:\n            k -= 1.0 + p[0]\n        y[FRICTION] += k"
+ROOT = "y[FRICTION] += p[0] * math.sqrt(5.0 - x[Q])"
+DIVISION = "y[FRICTION] += p[0] / (x[Q] - x[Q])"
+STRONG = "y[TORQUE] += 1e9 * p[0] * x[V]"
+
+
+def effect_file(folder: Path, body: str, typical: float = 0.01) -> str:
+    path = folder / "mine.py"
+    path.write_text(EFFECT.format(body=body, typical=typical), encoding="utf-8")
+    return f"{path}:Mine"
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    conditions: dict[str, Signals] = signals_of_set(conditions=("fast",), closures=2)
+    return write_set(tmp_path_factory.mktemp("set") / "bags", conditions)
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (ROOT, "gives no number (math domain error) at position 5"),
+        (DIVISION, "gives NaN or infinity"),
+        (STRONG, "Is the typical value too strong?"),
+        ("y[FRICTION] += undefined", "cannot be compiled"),
+    ],
+)
+def test_a_bad_effect_is_one_clear_error(
+    body: str,
+    said: str,
+    bags: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    source = effect_file(tmp_path, body)
+    out, truth = tmp_path / "out", tmp_path / "truth.yaml"
+    for words in (
+        ("diagnose", str(bags), "--effect", source),
+        ("hide", str(out), "--truth", str(truth), "--effect", source),
+    ):
+        code, _, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+        assert code == 2 and said in err and len(err.strip().splitlines()) == 1
+    assert not out.exists() and not truth.exists()
+
+
+def test_an_effect_that_hangs_is_ended(tmp_path: Path) -> None:
+    motion = (np.linspace(0.0, 1.0, 50), np.linspace(0.0, 10.0, 50))
+    for source in (effect_file(tmp_path, HANG), f"{tmp_path / 'endless.py'}:Mine"):
+        (tmp_path / "endless.py").write_text("while True:\n    pass\n", encoding="utf-8")
+        with pytest.raises(ValueError, match="loop that does not end"):
+            check_own_effects([source], lambda _: None, motion, limit=3.0)
+
+
+def test_a_simulation_that_diverges_is_penalised_and_counted() -> None:
+    from hannes_lab.hide import make_set
+
+    recordings, _ = make_set(Model.load(), [], seed=1, closures=2, conditions=["fast"])
+    prepared = prepare([make_trial(r) for r in recordings], Model.load())
+    residual = prepared.problem.residual(
+        prepared.model, {"friction.coulomb": math.nan, "hand.stiffness": -1e9}
+    )
+    assert np.all(residual == FAILED) and prepared.problem.failures == 1

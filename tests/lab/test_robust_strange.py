@@ -1,0 +1,70 @@
+"""Recordings that say nothing of themselves, of a hand with another controller and clock than the nominal's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hannes_bags.reading import read_bag
+from hannes_description.model import Model
+from hannes_lab.diagnose import Diagnosis, diagnose, effect_sources
+from hannes_lab.grasp import with_seen_objects
+from hannes_lab.hand import outer_loop
+from hannes_lab.prepare import load_trials, prepare
+from hannes_lab.trials import Trial
+from hannes_sim.effect import strength_of
+from lab.foreign_bags import Signals, signals_of_set, write_set
+
+STRANGE = {
+    "control.kp": 0.5,
+    "control.damping": 0.03,
+    "control.current_kp": 0.1,
+    "control.current_ki": 1200.0,
+}
+FEW = ("viscous_friction", "glove_stiffness", "wire_slack")
+
+
+def late(signals: Signals) -> Signals:
+    """The reference was logged 8 ms before the controller took it, at 100 Hz."""
+    t, v = signals["reference_position"]
+    at = np.arange(t[0], t[-1], 0.01)
+    return {**signals, "reference_position": (at - 0.008 + 0.01, np.interp(at, t, v))}
+
+
+def strange_set(folder: Path, *effects: str) -> list[Trial]:
+    conditions = signals_of_set(
+        model=Model.load().with_values(STRANGE),
+        effects=[strength_of(name, 2.0) for name in effects],
+        conditions=("slow", "fast", "grasp"),
+        closures=6,
+        seed=11,
+    )
+    return load_trials([write_set(folder / "bags", conditions, late)])
+
+
+def diagnosed(trials: list[Trial]) -> Diagnosis:
+    prepared = prepare(trials, Model.load())
+    return diagnose(prepared, effect_sources(only=FEW), max_effects=1)
+
+
+def test_what_was_grasped_and_how_it_was_controlled_is_read_from_the_closures(tmp_path: Path) -> None:
+    trials = strange_set(tmp_path)
+    seen = {t.name: t.options.get("object") for t in with_seen_objects(trials, Model.load())}
+    assert seen["slow"] is None and seen["fast"] is None and seen["grasp"]["stiffness"] > 5e3
+    loop = outer_loop([t for t in trials if t.name != "fast"])
+    assert loop is not None and loop[0] == pytest.approx(0.5, rel=0.25)
+    assert "sensors" not in read_bag(tmp_path / "bags" / "slow").metadata
+
+
+def test_a_strange_hand_lacks_nothing(tmp_path: Path) -> None:
+    found = diagnosed(strange_set(tmp_path))
+    assert found.verdict == "nothing"
+    assert any("something was grasped" in note for note in found.notes)
+
+
+def test_an_effect_is_found_on_a_strange_hand(tmp_path: Path) -> None:
+    found = diagnosed(strange_set(tmp_path, "viscous_friction"))
+    assert found.verdict == "effects" and [e.name for e in found.effects] == ["viscous_friction"]
+    p = found.effects[0].parameters["coefficient"]
+    assert p.value == pytest.approx(0.002, rel=0.25)
