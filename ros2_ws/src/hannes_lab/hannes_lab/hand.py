@@ -45,7 +45,7 @@ in the static error; of the inner one the thesis gives the order of magnitude.""
 WIDE_STEP = 0.1
 """Step of finite differences where the prior is wide: half of its width leads past every bend of the signals."""
 
-_UNKNOWN_ZERO_SD = 0.05
+_UNKNOWN_ZERO_SD = 0.1
 """rad; what a hand calls open whose homing nobody described."""
 
 _WIRE = "wire.stiffness"
@@ -70,8 +70,8 @@ holds the position; what the model does not know shows in what drives it."""
 
 RESTING = 0.05
 AT_REST = 10.0
-"""How many times larger that is while the reference is within this part of its span of its rest: the hand lies against
-its open stop on a slack wire, of which nothing is known."""
+"""How many times larger that is while reference or encoder is within this part of the reference's span of its rest: the
+hand lies against its open stop on a slack wire, of which nothing is known."""
 
 REFERENCE_LEAD = "log.reference_lead"
 LEAD_SEEN = 0.02
@@ -227,10 +227,14 @@ class HandRig(PlantRig):
         span = float(np.ptp(block.measured)) or 1.0
         sd = np.full(block.phase.size, OWN_ERROR.get(block.signal, OWN_ERROR_DRIVE) * span)
         closure = trial.of(block.condition)[0]
-        ticks = np.arange(trial.reference.size) * trial.period
-        reference = np.interp(closure.start + block.phase, ticks, trial.reference)
+        at = closure.start + block.phase
+        near = RESTING * float(np.ptp(trial.reference))
         rest = float(np.median(trial.reference[[0, -1]]))
-        sd[np.abs(reference - rest) < RESTING * float(np.ptp(trial.reference))] *= AT_REST
+        ticks = np.arange(trial.reference.size) * trial.period
+        resting = np.abs(np.interp(at, ticks, trial.reference) - rest) < near
+        if "encoder_position" in trial.signals:
+            resting |= np.abs(np.interp(at, *trial.signals["encoder_position"]) - rest) < near
+        sd[resting] *= AT_REST
         return sd
 
     def plant(self, model: Model, trial: Trial) -> Plant:
