@@ -260,7 +260,7 @@ def diagnose(
         chance=limits,
         costs={"nominal_fitted": null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
         nuisances=_nuisance_table(best.fit),
-        notes=(*prepared.notes, *choice.notes, *_identifiability_notes(best)),
+        notes=(*prepared.notes, *choice.notes, *_identifiability_notes(best), *_failed(search.problem)),
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
         model=model,
@@ -313,11 +313,11 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
             front += choice.search.refitted(far)
         needed = choice.limits.gain if enough else max(choice.limits.gain, WORTHWHILE * choice.best.fit.cost)
         worth = choice.best.penalised - 0.5 * needed
-        round_ = choice.search.extend(front, list(search.sources), texts[size - 1], worth)
+        round_ = _extended(choice.search, front, texts[size - 1], worth)
         if not round_:
             break
         ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in round_)
-        if choice.best.penalised - round_[0].penalised < needed:
+        if choice.best.fit.cost - round_[0].fit.cost < needed:
             choice = replace(choice, ranking=ranking)
             break
         new = choice.search.renewed(round_[0])
@@ -334,6 +334,28 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         choice = _Choice(new, best, limits_new, best.fit.cost <= ADEQUATE * limits_new.misfit, ranking, close)
         front, far = [best, *near[1:]], [c for c in wide if c not in rivals]
     return choice
+
+
+def _extended(search: Search, front: Sequence[Candidate], text: str, worth: float) -> list[Candidate]:
+    """The front with one further effect each, best first.
+
+    Where the best set holds a smaller one that was not extended, that is extended too: the other effect of a pair may be
+    the right one though it was not among the best alone.
+    """
+    names = list(search.sources)
+    round_ = search.extend(front, names, text, worth)
+    extended = {frozenset(c.names) for c in front}
+    while round_ and round_[0].penalised < worth and len(round_[0].names) > 1:
+        parts = [frozenset(n for n in round_[0].names if n != one) for one in round_[0].names]
+        left = [p for p in parts if p not in extended]
+        if not left:
+            break
+        bases = [search.fitted(tuple(sorted(p))) for p in left]
+        extended |= set(left)
+        better = search.extend(bases, names, f"{text}, exchanged", round_[0].penalised)
+        sets = {frozenset(c.names): c for c in sorted((*round_, *better), key=lambda c: -c.penalised)}
+        round_ = sorted(sets.values(), key=lambda c: c.penalised)
+    return round_
 
 
 def _worth_showing(
@@ -501,6 +523,15 @@ def _nuisance_table(found: Fit) -> dict[str, dict[str, Any]]:
         for c, z in zip(found.coordinates, found.z, strict=True)
         if c.prior
     }
+
+
+def _failed(problem: Problem) -> list[str]:
+    """How many simulations did not stay finite; a fit takes them for very bad."""
+    if not problem.failures:
+        return []
+    return [
+        f"{problem.failures} of {problem.simulations} simulations did not stay finite and counted as very bad fits"
+    ]
 
 
 def _identifiability_notes(best: Candidate) -> list[str]:
