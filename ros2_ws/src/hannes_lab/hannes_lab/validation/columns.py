@@ -183,9 +183,9 @@ def _motors() -> str:
         for h in hands
     ]
     return (
-        f"Two motors are named options. Calibrated on the same figures: {'; '.join(ends)}. The currents of the void "
-        "and soft hand do not tell them apart; R12 with R13 speaks for the one of the lower cost: the other has little "
-        "torque left at R10 for the force beside the friction that R12 asks for. One datum would decide, the voltage "
+        f"Two motors are named options. Calibrated on the same figures: {'; '.join(ends)}. The difference of the "
+        "costs is no proof: it is of the size that another definition of one figure makes. One datum would decide, the "
+        "voltage "
         f"at the stalled grip of R10: {' against '.join(volts)} (+-5 % of winding tolerance); or the pulley's speed "
         f"without load at {SLOW_VOLTAGE:g} V, at most {' against '.join(speeds)}, or the motor's label."
     )
