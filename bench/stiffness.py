@@ -52,6 +52,11 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 SIGNED = Sensors(current_rectified=False)
 
 
+def kept(work: Path, what: str, *models: Model) -> Path:
+    """Folder of a data set; a model that has changed has another one."""
+    return work / "_".join([what, *(f"{model.name}_{model.sha256[:8]}" for model in models)])
+
+
 def percent(value: float | None) -> str:
     return "-" if value is None else f"{100.0 * value:.1f} %"
 
@@ -205,7 +210,7 @@ def main() -> int:
 
     def test(model: str, closures: int) -> Dataset:
         scenes = bench_scenes(given.hands, closures, model=models[model].name)
-        folder = given.work / f"ten_{model}_{given.hands}_{closures}"
+        folder = kept(given.work, f"ten_{given.hands}_{closures}", models[model])
         return make_dataset(scenes, models[model], seed=SEED, jobs=given.jobs, folder=folder)
 
     def say(text: str) -> None:
@@ -226,14 +231,14 @@ def main() -> int:
     pentagons: list[Closure] = []
     for model in (CALIBRATED, NOMINAL):
         scenes = bench_scenes(1, 5, model=models[model].name, varied=False, objects=PENTAGONS)
-        folder = given.work / f"pentagons_{model}"
+        folder = kept(given.work, "pentagons", models[model])
         pentagons += make_dataset(scenes, models[model], seed=SEED, jobs=given.jobs, folder=folder).closures
     results["pentagons"] = scores_of(answer(window, pentagons))
     results["pentagons, thesis' method"] = scores_of(answer(thesis, pentagons))
     say("Unseen objects of any stiffness.")
     wide = make_dataset(
         draw_scenes(300, SEED, hands=100, models=[models[CALIBRATED].name], variety="wide"),
-        models[CALIBRATED], seed=SEED, jobs=given.jobs, folder=given.work / "wide",
+        models[CALIBRATED], seed=SEED, jobs=given.jobs, folder=kept(given.work, "wide", models[CALIBRATED]),
     ).closures  # fmt: skip
     answered_wide = answer(window, wide)
     results["wide"] = scores_of(answered_wide)
@@ -383,8 +388,8 @@ def ablation_table(given, models, closures, results, say) -> str:  # type: ignor
             closures, SEED + 1, hands=closures // 2 if varied else 1, models=names, variety=variety,
             objects=closures // 2 if varied else None,
         )  # fmt: skip
-        folder = given.work / f"train_{variety}_{closures}"
         used = [models[name] for name in (CALIBRATED, NOMINAL, REDUCED)]
+        folder = kept(given.work, f"train_{variety}_{closures}", *used)
         return make_dataset(scenes, *used, seed=SEED + 1, jobs=given.jobs, sensors=SIGNED, folder=folder)
 
     say("Data sets of the ablations.")
@@ -393,7 +398,7 @@ def ablation_table(given, models, closures, results, say) -> str:  # type: ignor
     ten = make_dataset(
         bench_scenes(given.hands, 2 * FEW, model=models[CALIBRATED].name),
         models[CALIBRATED], seed=SEED, jobs=given.jobs, sensors=SIGNED,
-        folder=given.work / f"ten_signed_{given.hands}",
+        folder=kept(given.work, f"ten_signed_{given.hands}", models[CALIBRATED]),
     ).closures  # fmt: skip
     low, high = VARIETIES["narrow"].stiffness
     clear = [

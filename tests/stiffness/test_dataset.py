@@ -279,6 +279,14 @@ def windowed(tmp_path_factory):
     )
 
 
+def test_one_hand_is_not_held_out(tmp_path):
+    data = make_dataset(draw_scenes(40, 4), MODEL, seed=4)
+    path = train(data, tmp_path / "one.onnx", seed=4, method="logistic", settings=TreeSettings(folds=2))
+    scores = StiffnessClassifier.load(path).manifest["scores"]["cross_validation"]["logistic"]
+    assert "objects" in scores
+    assert "hands" not in scores
+
+
 def test_a_classifier_on_windows_beats_chance_and_says_when_it_is_not_sure(windowed):
     path, other = windowed
     classifier = StiffnessClassifier.load(path)

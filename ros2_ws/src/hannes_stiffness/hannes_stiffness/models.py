@@ -11,6 +11,7 @@ scikit-learn is imported at its first use.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -205,7 +206,12 @@ def fit(
     model = chosen.make(seed, settings)
     if chosen.features == SINGLE_SAMPLE:
         return model.fit(used.values, used.labels)
-    return model.fit(used.values, used.labels, **{chosen.weight: class_weights(used.labels)})
+    from sklearn.exceptions import ConvergenceWarning
+
+    with warnings.catch_warnings():
+        # The network stops after its epochs on purpose: going on would learn the training hands by heart.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return model.fit(used.values, used.labels, **{chosen.weight: class_weights(used.labels)})
 
 
 def class_weights(labels: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -78,7 +78,10 @@ def train(
     }
     scores: dict[str, Any] = {}
     out_of_fold: dict[str, NDArray[np.float64]] = {}
-    groupings = ("closures",) if method == THESIS_METHOD else COMPARED
+    groupings: tuple[str, ...] = ("closures",) if method == THESIS_METHOD else COMPARED
+    if all(c.scene.hand == dataset.closures[0].scene.hand for c in dataset.closures):
+        # One hand cannot be held out.
+        groupings = tuple(g for g in groupings if g != "hands")
     for name in names:
         used = data[specs[name].version, method != THESIS_METHOD]
         scores[name] = {"title": METHODS[name].title, "samples": len(used.labels)}
@@ -92,7 +95,7 @@ def train(
     if method == BEST:
         windows = [n for n in names if METHODS[n].features != SINGLE_SAMPLE]
         # Not the log loss: the probabilities are calibrated afterwards.
-        chosen = max(windows, key=lambda n: sum(scores[n][g]["overlap_50ms"]["f1"] for g in COMPARED))
+        chosen = max(windows, key=lambda n: sum(scores[n][g]["overlap_50ms"]["f1"] for g in groupings))
     spec = specs[chosen]
     used = data[spec.version, method != THESIS_METHOD]
     say(f"Training {METHODS[chosen].title} on all of them.")
