@@ -65,7 +65,7 @@ SETS: tuple[tuple[str, str | None, float], ...] = (
 """What is hidden: label, effect, strength in typical values."""
 
 METHODS = ("nominal", "parameters", "sysid", "sindy", "lab")
-SEEDS = (61_001, 61_002)
+FIRST_SEED = 61_001
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def _moved(z: Array, prepared: Prepared) -> str:
 def sindy(prepared: Prepared) -> dict[str, Any]:
     """Sparse regression on the torque residual, its threshold by held-out closures of the training part."""
     import pysindy
-    from sparse_terms import NAMES, regression
+    from sparse_terms import NAMES, TITLES, SparseTerms, regression
 
     theta, residual, groups = regression(prepared, training=True)
     scale = np.sqrt((theta**2).mean(axis=0)) + 1e-12
@@ -203,11 +203,11 @@ def sindy(prepared: Prepared) -> dict[str, Any]:
     # the sparsest whose error is within one standard error of the least (Hastie, Tibshirani, Friedman 2009, 7.10)
     least = min(tried, key=lambda one: one[0])
     found = [c for error, _, c in tried if error <= least[0] + least[1]][-1]
-    kind = load_effect(TERMS)
+    kind = SparseTerms
     bounds = {p.name: (p.lower, p.upper) for p in kind.parameters}
     values = {n: float(np.clip(c, *bounds[n])) for n, c in zip(NAMES, found, strict=True)}
     model = prepared.model.with_effect(kind.entry(values, source=TERMS))
-    terms = [f"{c:+.2g} {kind.title_of(n)}" for n, c in zip(NAMES, found, strict=True) if c != 0.0]
+    terms = [f"{c:+.2g} {TITLES[n]}" for n, c in zip(NAMES, found, strict=True) if c != 0.0]
     return {"error": judged(prepared, model, {}), "names": " ".join(terms) or "-"}
 
 
@@ -258,6 +258,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--methods", default=",".join(METHODS), help="which of " + ", ".join(METHODS))
     parser.add_argument("--out", type=Path, default=Path("out/comparison"), help="folder of the kept results")
+    parser.add_argument("--seeds", type=int, default=2, help="sets per hidden effect")
     options = parser.parse_args()
     methods = options.methods.split(",")
     if set(methods) - set(METHODS):
@@ -267,7 +268,8 @@ def main() -> int:
             print(f"{method} is left out: {why}", file=sys.stderr)
             methods.remove(method)
     options.out.mkdir(parents=True, exist_ok=True)
-    cases = [Case(*one, seed, method) for one in SETS for seed in SEEDS for method in methods]
+    seeds = range(FIRST_SEED, FIRST_SEED + options.seeds)
+    cases = [Case(*one, seed, method) for seed in seeds for one in SETS for method in methods]
     files = [options.out / f"{case.key}.json" for case in cases]
     todo = [(c, f) for c, f in zip(cases, files, strict=True) if not f.exists()]
     print(f"{len(cases)} results, {len(cases) - len(todo)} kept from before", file=sys.stderr)

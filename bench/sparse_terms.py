@@ -40,10 +40,6 @@ class SparseTerms(Effect):
         )
     )  # fmt: skip
 
-    @classmethod
-    def title_of(cls, name: str) -> str:
-        return TITLES[name]
-
     @staticmethod
     def contribute(x: Any, p: Any, s: Any, y: Any) -> None:
         q, v = x[Q], x[V]

@@ -2,16 +2,19 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.diagnose import effect_sources
 from hannes_lab.greedy import grow
+from hannes_lab.inverse import force_residual, rows
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.rig import load_rig
 from hannes_lab.screen import usable_effects
 from hannes_lab.search import Search
 from hannes_lab.spectrum import position_periods
+from hannes_sim.effect import load_effect
 
 
 @pytest.fixture(scope="session")
@@ -87,3 +90,17 @@ def test_the_ripple_of_the_screw_is_in_the_spectrum(prepared: Prepared) -> None:
         best = search.add(best, name)
     periods = position_periods(prepared.problem, best.fit, 1e-3, 0.2)
     assert min(abs(p - 2.5e-3) for p in periods) < 2e-5
+
+
+def test_inverse_dynamics_needs_no_controller(prepared: Prepared) -> None:
+    """The force that mass, viscous and Coulomb friction need for the measured motion, as found before (5.9 N)."""
+    trial = prepared.features.trials[0]
+    model = prepared.model.with_effect(
+        prepared.rig.effect(load_effect("coulomb_friction")).entry({"level": 19.87})
+    )
+    values = {"motor.armature": 94.96, "friction.viscous": 209.6}
+    error = force_residual(prepared.rig, model, values, trial)
+    moving = np.logical_or.reduce([rows(trial, c) for c in trial.conditions])
+    assert float(np.sqrt(np.mean(error[moving] ** 2))) < 6.0
+    without = force_residual(prepared.rig, prepared.model, values, trial)
+    assert float(np.sqrt(np.mean(without[moving] ** 2))) > 15.0

@@ -1,0 +1,110 @@
+"""A real machine, the EMPS bench: `python bench/emps.py [DATA_EMPS.mat] [--jobs N]`.
+
+Grows a model from mass and viscous friction by `--greedy` and prints what each effect is worth on moves that took no
+part in its fit: by closed-loop simulation, and of the force by inverse dynamics (then fitted so).  The data are not
+part of the project; their default place is $HANNES_DATA/emps/DATA_EMPS.mat.  Interrupted, it goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from hannes_description.model import Model
+from hannes_lab.cache import Store
+from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.executor import Executor
+from hannes_lab.inverse import force_residual, rows
+from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.problem import effect_coordinates, nuisance_coordinate, vanishing_entry
+from hannes_lab.rig import load_rig
+from hannes_sim.effect import load_effect
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+Array = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("HANNES_DATA", ROOT.parent / "shared" / "data")) / "emps" / "DATA_EMPS.mat"
+
+
+def left_out(
+    prepared: Prepared, names: tuple[str, ...], start: dict[str, float]
+) -> tuple[dict[str, float], float]:
+    """Parameters of a set fitted to the force of all moves by inverse dynamics, and its error on moves left out, N."""
+    rig, trial = prepared.rig, prepared.features.trials[0]
+    model, coordinates = prepared.model, [nuisance_coordinate(n) for n in prepared.nuisances]
+    for name in names:
+        kind = rig.effect(load_effect(name))
+        model = model.with_effect(vanishing_entry(kind, None))
+        coordinates += effect_coordinates(kind)
+    low, high = np.array([c.bounds for c in coordinates]).T
+
+    def values(z: Array) -> dict[str, float]:
+        return {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
+
+    def fitted(z: Array, used: NDArray[np.bool_]) -> Array:
+        def residual(point: Array) -> Array:
+            return force_residual(rig, model, values(point), trial)[used]
+
+        inside = np.clip(z, low + 1e-9, high - 1e-9)
+        steps = np.array([1e-3 * c.step if c.log else c.step for c in coordinates])
+        found = least_squares(
+            residual, inside, jac=lambda p: _slopes(residual, p, steps, high), bounds=(low, high), max_nfev=10
+        )
+        return np.asarray(found.x, dtype=np.float64)
+
+    own = {c: rows(trial, c) for c in trial.conditions}
+    moving = np.logical_or.reduce(list(own.values()))
+    whole = fitted(np.array([c.z(start[c.name]) for c in coordinates]), moving)
+    power, ticks = 0.0, 0
+    for used in own.values():
+        z = fitted(whole, moving & ~used)
+        power += float(np.sum(force_residual(rig, model, values(z), trial)[used] ** 2))
+        ticks += int(used.sum())
+    return values(whole), float(np.sqrt(power / ticks))
+
+
+def _slopes(residual: Callable[[Array], Array], z: Array, steps: Array, high: Array) -> Array:
+    here = residual(z)
+    columns = []
+    for k, size in enumerate(steps):
+        step = -size if z[k] + size > high[k] else size
+        columns.append((residual(z + step * np.eye(z.size)[k]) - here) / step)
+    return np.column_stack(columns)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", nargs="?", type=Path, default=DATA)
+    parser.add_argument("--jobs", type=int, default=2)
+    options = parser.parse_args()
+    if not options.data.is_file():
+        print(f"no {options.data}: nothing is measured; give the path of DATA_EMPS.mat", file=sys.stderr)
+        return 0
+    rig = load_rig(f"{ROOT / 'examples' / 'emps' / 'emps.py'}:Emps")
+    model = Model.load(rig.model)
+    prepared = prepare(rig.read([options.data]), model, rig=rig)
+    with Executor(options.jobs, store=Store()) as executor:
+        found = diagnose(prepared, effect_sources(model=model), executor=executor, max_effects=7, greedy=True)
+    names = tuple(e.name for e in found.effects)
+    print(f"{'added':<32} {'position, um':>14} {'force, N':>10} {'inverse dynamics, N':>21}")
+    for k, fall in enumerate(found.falls[1:]):
+        held = fall.held_out_signals
+        _, inverse = left_out(prepared, names[:k], dict(found.values))
+        print(
+            f"{fall.added:<32} {1e6 * held['encoder_position']:>14.2f} {held['drive_force']:>10.2f} {inverse:>21.2f}"
+        )
+    print(f"mass {found.values['motor.armature']:.2f} kg, {len(names)} effects", end="")
+    print(f", ripple {1e3 * found.values['cogging.period']:.4f} mm" if "cogging" in names else "")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
