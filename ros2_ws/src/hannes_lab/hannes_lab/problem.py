@@ -96,7 +96,7 @@ def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
         nuisance.mean,
         nuisance.sd,
         nuisance.log,
-        -np.inf,
+        nuisance.lower,
         np.inf,
         True,
         nuisance.step,

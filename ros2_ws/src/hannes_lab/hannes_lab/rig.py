@@ -38,6 +38,11 @@ REFERENCE_SIZES = {"N.m": 0.05, "rad": 14.57, "V": 12.0, "A": 1.0, "s": 1.0}
 14.57 rad at up to 12 V and about 1 A.  Another machine's follow from these by dimension."""
 
 
+NARROW = 0.25
+LEAST = 0.01
+"""Relative tolerances up to the first are on a linear scale, down to this part of the nominal value: an effect that adds
+to the parameter then leaves a straight valley, along which a fit finds its way."""
+
 REMEMBERED = 48
 """Simulations whose signals are kept: those of a whole Jacobian of three trials."""
 
@@ -52,6 +57,7 @@ class Nuisance:
     log          positive parameter, treated on a logarithmic scale
     closure_sd   scatter from closure to closure, same scale as sd
     step         of finite differences, in sd: small where the prior is wide
+    lower        least value, for a positive parameter on a linear scale
     """
 
     name: str
@@ -61,6 +67,7 @@ class Nuisance:
     closure_sd: float = 0.0
     unit: str = ""
     step: float = 0.5
+    lower: float = -math.inf
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.sd) and self.sd > 0.0):
@@ -184,8 +191,10 @@ class PlantRig:
             raise HannesError(
                 f"{self.population}: '{name}' needs the numbers sd and closure_sd, and a unit ({error})."
             ) from error
-        unit = model.parameters[name].unit
-        return Nuisance(name, model.parameters.value(name), sd, relative, scatter, unit)
+        unit, mean = model.parameters[name].unit, model.parameters.value(name)
+        if relative and sd <= NARROW and mean > 0.0:
+            return Nuisance(name, mean, sd * mean, False, scatter * mean, unit, lower=LEAST * mean)
+        return Nuisance(name, mean, sd, relative, scatter, unit)
 
     def own_error(self, block: Block) -> Array:
         """See Rig."""

@@ -53,14 +53,21 @@ class Candidate:
     fit: Fit
     penalised: float
 
+    @property
+    def pulled(self) -> bool:
+        """True where a nuisance parameter is far from its nominal value."""
+        return any(c.prior and abs(z) > PULLED for c, z in zip(self.fit.coordinates, self.fit.z, strict=True))
+
 
 KEEP = 1
 """Points of each scan (from the base fit, and from the nominal values) from which an effect is refitted."""
 
 REFIT = 8
-REFIT_ALL = 32
-"""Extensions of a round that are refitted in closed loop; all of them where there are few.  A scan does not see an effect
-that a nuisance parameter has taken over far from its nominal value."""
+"""Extensions of a round that are refitted in closed loop."""
+
+PULLED = 4.0
+"""Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are refitted: it may have
+taken over an effect, which a scan does not see."""
 
 POLISH = 3
 """Extensions of a round that are refitted with all derivatives afresh."""
@@ -249,8 +256,13 @@ class Search:
 
     @staticmethod
     def _inside(z: Array, base: Fit) -> Array:
-        """Nuisance parameters within eight standard deviations, the others within their bounds."""
-        bounds = np.array([(-8.0, 8.0) if c.prior else c.bounds for c in base.coordinates]).reshape(-1, 2)
+        """The others within their bounds; nuisance parameters too, and not further off than eight standard deviations or
+        the base."""
+        bounds = np.array([c.bounds for c in base.coordinates]).reshape(-1, 2)
+        for k, c in enumerate(base.coordinates):
+            if c.prior:
+                reach = max(8.0, abs(float(base.z[k])))
+                bounds[k] = max(-reach, bounds[k, 0]), min(reach, bounds[k, 1])
         return np.asarray(np.clip(z, bounds[:, 0], bounds[:, 1]), dtype=np.float64)
 
     def add(
@@ -337,7 +349,9 @@ class Search:
         problem = build_problem(
             rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values, self.problem.counts
         )
-        return Search(problem, self.model, self.nuisances, self.sources, self.executor, self.progress, self.rows)
+        return Search(
+            problem, self.model, self.nuisances, self.sources, self.executor, self.progress, self.rows
+        )
 
     def refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
         """A candidate of another problem (other noise), fitted in this one from its point."""
@@ -351,6 +365,14 @@ class Search:
         )
         free = sum(1 for c in new.coordinates if not c.prior)
         return Candidate(candidate.names, new, new.cost + PENALTY * free)
+
+    def fitted(self, names: Names) -> Candidate:
+        """The fit of a set: the known one, or one effect after the other."""
+        found = self.null()
+        for k, name in enumerate(names):
+            known = self.found.get(tuple(sorted(names[: k + 1])))
+            found = known or self.polish(self.add(found, name))
+        return found
 
     def refitted(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         """Candidates of another problem, each fitted in this one unless it was already."""
@@ -379,7 +401,11 @@ class Search:
         self._prior_points = {_point_of(base.fit): point for base, point in zip(bases, points, strict=True)}
         scans = self.each(_scan_in_worker, list(todo.values()), f"{text}: scan")
         order = sorted(zip(todo.values(), scans, strict=True), key=lambda item: item[1][0][0])
-        chosen = [(base, name, [s for _, s in starts]) for (base, name), starts in order[: REFIT if len(order) > REFIT_ALL else None]]
+        chosen = [
+            (base, name, [s for _, s in starts])
+            for k, ((base, name), starts) in enumerate(order)
+            if k < REFIT or base.pulled
+        ]
         refitted = self.each(_add_in_worker, chosen, f"{text}: refit")
         for candidate in refitted:
             self.found[tuple(sorted(candidate.names))] = candidate

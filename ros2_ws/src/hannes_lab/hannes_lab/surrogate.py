@@ -18,7 +18,7 @@ from hannes_description.model import Model
 from hannes_sim.effect import EffectType
 from numpy.typing import NDArray
 
-from .features import compact_end, has_memory
+from .features import Block, compact_end, has_memory
 from .problem import Coordinate
 from .rig import Nuisance, PlantRig, Rig
 from .trials import Trial
