@@ -24,6 +24,7 @@ import io
 import json
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -213,7 +214,9 @@ def sindy(prepared: Prepared) -> dict[str, Any]:
 
 def _sparse(pysindy: Any, theta: Array, residual: Array, threshold: float) -> Array:
     optimizer = pysindy.STLSQ(threshold=float(threshold), alpha=1e-6)
-    optimizer.fit(theta, residual[:, None])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that a threshold leaves no term
+        optimizer.fit(theta, residual[:, None])
     return np.asarray(optimizer.coef_, dtype=np.float64).ravel()
 
 
