@@ -1,7 +1,8 @@
 """How good the stiffness classifier is: the targets beside what was measured, the thesis' method in the same run.
 
-    python bench/stiffness.py                  everything, about half an hour on one core
+    python bench/stiffness.py                  everything, about a quarter of an hour on one core
     python bench/stiffness.py --closures 13 --hands 13   a third of the closures, without the ablations
+    python bench/stiffness.py --seed 4711 --ablations 0   other hands: how much of it is the draw
     python bench/stiffness.py --write          also put the tables into docs/stiffness.md, the pictures beside it
 
 Every seed here is another than those of the training. Data sets are kept in --work, so that a second run goes on.
@@ -116,7 +117,7 @@ def over_hands(answered: Sequence[Answered]) -> tuple[tuple[float, float], tuple
     return low, high
 
 
-def errors(wide: Sequence[Answered], ten: Sequence[Answered], model: Model) -> tuple[str, str]:
+def errors(wide: Sequence[Answered], ten: Sequence[Answered], model: Model, seed: int) -> tuple[str, str]:
     """Where the wrong answers are, of the samples on which no rule decides: objects of any stiffness by stiffness and
     by time since the contact; the ten objects by hidden effect."""
 
@@ -169,7 +170,7 @@ def errors(wide: Sequence[Answered], ten: Sequence[Answered], model: Model) -> t
     for a in ten:
         hand = a.closure.scene.hand
         if hand not in names:
-            hidden = hand_of(model, hand, SEED, varied=True).effects
+            hidden = hand_of(model, hand, seed, varied=True).effects
             strengths = {e.name: dict(e.values) for e in model.effects}
             names[hand] = [e.name for e in hidden if e.name not in own or dict(e.values) != strengths[e.name]]
     rows = []
@@ -196,6 +197,9 @@ def main() -> int:
     )
     parser.add_argument("--closures", type=int, default=39, help="closures on each of the ten objects")
     parser.add_argument("--hands", type=int, default=39, help="hands of the population")
+    parser.add_argument(
+        "--seed", type=int, default=SEED, help="of hands, effects, noise; no seed of a training"
+    )
     parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "hannes_bench_stiffness")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument(
@@ -204,6 +208,7 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help="put tables and pictures into docs")
     parser.add_argument("--json", type=Path, help="write all scores to this file")
     given = parser.parse_args()
+    given.work /= f"seed_{given.seed}"
     ablations = given.ablations if given.closures >= 39 else 0
 
     models = {name: Model.load(name) for name in (CALIBRATED, NOMINAL, REDUCED, UNSEEN)}
@@ -211,7 +216,7 @@ def main() -> int:
     def test(model: str, closures: int) -> Dataset:
         scenes = bench_scenes(given.hands, closures, model=models[model].name)
         folder = kept(given.work, f"ten_{given.hands}_{closures}", models[model])
-        return make_dataset(scenes, models[model], seed=SEED, jobs=given.jobs, folder=folder)
+        return make_dataset(scenes, models[model], seed=given.seed, jobs=given.jobs, folder=folder)
 
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
@@ -232,17 +237,19 @@ def main() -> int:
     for model in (CALIBRATED, NOMINAL):
         scenes = bench_scenes(1, 5, model=models[model].name, varied=False, objects=PENTAGONS)
         folder = kept(given.work, "pentagons", models[model])
-        pentagons += make_dataset(scenes, models[model], seed=SEED, jobs=given.jobs, folder=folder).closures
+        pentagons += make_dataset(
+            scenes, models[model], seed=given.seed, jobs=given.jobs, folder=folder
+        ).closures
     results["pentagons"] = scores_of(answer(window, pentagons))
     results["pentagons, thesis' method"] = scores_of(answer(thesis, pentagons))
     say("Unseen objects of any stiffness.")
     wide = make_dataset(
-        draw_scenes(300, SEED, hands=100, models=[models[CALIBRATED].name], variety="wide"),
-        models[CALIBRATED], seed=SEED, jobs=given.jobs, folder=kept(given.work, "wide", models[CALIBRATED]),
+        draw_scenes(300, given.seed, hands=100, models=[models[CALIBRATED].name], variety="wide"),
+        models[CALIBRATED], seed=given.seed, jobs=given.jobs, folder=kept(given.work, "wide", models[CALIBRATED]),
     ).closures  # fmt: skip
     answered_wide = answer(window, wide)
     results["wide"] = scores_of(answered_wide)
-    by_sample, by_effect = errors(answered_wide, answered, models[CALIBRATED])
+    by_sample, by_effect = errors(answered_wide, answered, models[CALIBRATED], given.seed)
     (f1_low, f1_high), (grasps_low, grasps_high) = over_hands(answered)
     median, slowest = cost_of_an_answer(window, answered[0].closure)
     loading = loading_time()
@@ -298,9 +305,13 @@ def main() -> int:
             row("loading the classifier", "< 100 ms", f"{1e3 * loading:.0f} ms", "", loading < 0.1),
         ],
     )  # fmt: skip
+    targets += (
+        "\n\nFrom the first contact to a grip of 2 N, median: "
+        f"{milliseconds(late['contact_to_grip_median_s'])}."
+    )
     made_with = ", ".join(f"{name} {model.sha256[:8]}" for name, model in models.items())
     targets += (
-        "\n\nIn brackets: 95 % interval over the hands (bootstrap). Models: "
+        " In brackets: 95 % interval over the hands (bootstrap). Models: "
         f"{made_with}; classifier {window.manifest['onnx']['sha256'][:8]}, baseline "
         f"{thesis.manifest['onnx']['sha256'][:8]}."
     )
@@ -385,19 +396,21 @@ def ablation_table(given, models, closures, results, say) -> str:  # type: ignor
     def data(variety: str) -> Dataset:
         varied = variety == "wide"
         scenes = draw_scenes(
-            closures, SEED + 1, hands=closures // 2 if varied else 1, models=names, variety=variety,
+            closures, given.seed + 1, hands=closures // 2 if varied else 1, models=names, variety=variety,
             objects=closures // 2 if varied else None,
         )  # fmt: skip
         used = [models[name] for name in (CALIBRATED, NOMINAL, REDUCED)]
         folder = kept(given.work, f"train_{variety}_{closures}", *used)
-        return make_dataset(scenes, *used, seed=SEED + 1, jobs=given.jobs, sensors=SIGNED, folder=folder)
+        return make_dataset(
+            scenes, *used, seed=given.seed + 1, jobs=given.jobs, sensors=SIGNED, folder=folder
+        )
 
     say("Data sets of the ablations.")
     wide, two = data("wide"), data("two")
     without = [c for c in wide.closures if c.scene.model != models[CALIBRATED].name]
     ten = make_dataset(
         bench_scenes(given.hands, 2 * FEW, model=models[CALIBRATED].name),
-        models[CALIBRATED], seed=SEED, jobs=given.jobs, sensors=SIGNED,
+        models[CALIBRATED], seed=given.seed, jobs=given.jobs, sensors=SIGNED,
         folder=kept(given.work, f"ten_signed_{given.hands}", models[CALIBRATED]),
     ).closures  # fmt: skip
     low, high = VARIETIES["narrow"].stiffness
@@ -430,8 +443,8 @@ def ablation_table(given, models, closures, results, say) -> str:  # type: ignor
     ):
         say(f"Ablation: {title}.")
         path = train(
-            used, given.work / "ablation.onnx", seed=SEED, method=method, current=current, void_current=void_current,
-            settings=TreeSettings(folds=3),
+            used, given.work / "ablation.onnx", seed=given.seed, method=method, current=current,
+            void_current=void_current, settings=TreeSettings(folds=3),
         )  # fmt: skip
         scores = scores_of(answer(StiffnessClassifier.load(path), ten))
         results[f"ablation: {title}"] = scores

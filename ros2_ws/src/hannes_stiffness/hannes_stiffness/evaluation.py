@@ -188,8 +188,8 @@ def latencies(named: Sequence[tuple[str, Answered]]) -> dict[str, Any]:
     Over the grasps whose object showed; a grasp that is never answered rightly counts as infinitely late.
     """
 
-    def of(rows: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
-        touch, grip = (np.array([r[k] for r in rows if not math.isnan(r[k])]) for k in (0, 1))
+    def of(rows: Sequence[tuple[float, ...]]) -> dict[str, Any]:
+        touch, grip, between = (np.array([r[k] for r in rows if not math.isnan(r[k])]) for k in (0, 1, 3))
         shown = np.array([r[2] for r in rows])
         late = shown[np.isfinite(shown)]
         return {
@@ -200,6 +200,7 @@ def latencies(named: Sequence[tuple[str, Answered]]) -> dict[str, Any]:
             if len(touch)
             else None,
             "from_grip_median_s": _number(float(np.median(grip))) if len(grip) else None,
+            "contact_to_grip_median_s": _number(float(np.median(between))) if len(between) else None,
             "from_void_current_median_s": _number(float(np.median(shown))) if len(shown) else None,
             "from_void_current_mean_s": _number(float(late.mean())) if len(late) else None,
         }
@@ -215,6 +216,7 @@ def latencies(named: Sequence[tuple[str, Answered]]) -> dict[str, Any]:
                     a.latency(touched) if math.isfinite(touched) else math.nan,
                     a.latency(float(gripped[0])) if len(gripped) else math.nan,
                     a.latency(shown),
+                    float(gripped[0]) - touched if len(gripped) else math.nan,
                 )
             )
     return {
