@@ -68,7 +68,7 @@ def _try(source: str, simulate: Simulate, motion: tuple[Array, Array], answer: C
     said = ""
     try:
         kind = load_effect(source)
-        compile_effect(kind)
+        compile_effect(kind)  # type: ignore[arg-type]  # a class is hashable
         with np.errstate(all="ignore"):
             said = _without_number(kind, source, *motion)
     except HannesError as error:
