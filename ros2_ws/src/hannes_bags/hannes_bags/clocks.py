@@ -6,8 +6,8 @@ If the recorder ran on the computer's clock while the stamps are simulated time 
 the two do not compare: the log times are then carried over onto the clock of the stamps.
 
 - same      the stamps are up to 20 ms before the log times: log times are used as they are.
-- offset    the two run at one rate with a constant difference, and what was logged before it was measured was measured on
-            another clock: the median difference is subtracted.
+- offset    the two run at one rate with a constant difference, and what was logged before it was measured was
+            measured on another clock: the median difference is subtracted.
 - warped    they run at different rates (a simulation faster or slower than real time): log times are
             interpolated between the pairs (log time, stamp) of the stamped topic. A header-less message then
             lies between the stamped messages around it, so its time is right to one period of that topic and

@@ -387,8 +387,8 @@ class _Reader:
             return times, values
         first = int(np.argmin(good))
         self.warnings.append(
-            f"{int((~good).sum())} of {len(good)} samples of {name} are not finite numbers (the first is message {first}); "
-            "they were left out."
+            f"{int((~good).sum())} of {len(good)} samples of {name} are not finite numbers (the first is message "
+            f"{first}); they were left out."
         )
         return (times[good], values[good]) if good.any() else None
 
