@@ -311,6 +311,9 @@ def main() -> int:
     parser.add_argument(
         "--out", type=Path, default=Path("out/identification"), help="folder of the kept results"
     )
+    parser.add_argument(
+        "--part", default="1/1", help="which part of the sets, as K/N: every N-th, from the K-th on"
+    )
     parser.add_argument("--list", action="store_true", help="print every result that is not as hidden")
     options = parser.parse_args()
     kinds = options.sets.split(",")
@@ -325,6 +328,10 @@ def main() -> int:
         limits = detection_factors(sorted(catalogue()))
         limits_file.write_text(json.dumps(limits))
     todo = cases(kinds, limits, options.quick, TUNING_SEED if options.tuning else JUDGING_SEED)
+    first, _, step = options.part.partition("/")
+    if not (first.isdigit() and step.isdigit() and 1 <= int(first) <= int(step)):
+        raise HannesError(f"--part {options.part}: give K/N with 1 <= K <= N, such as 1/2.")
+    todo = todo[int(first) - 1 :: int(step)]
     results: list[dict[str, Any]] = []
     missing = []
     for case in todo:

@@ -52,6 +52,9 @@ HOPELESS = 10.0
 RIVAL = 2.0
 """Sets whose cost is at most so many times that of the best are judged beside it with the noise found at it."""
 
+FAR = 4.0
+"""Standard deviations of its prior at which a nominal parameter is called far off."""
+
 MAX_EFFECTS = 3
 
 WIDE = (4, 3)
@@ -302,14 +305,17 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
     Sets of one, two and three effects in turn; each round extends the best of the round before by every effect, so that
     two effects of which neither is best alone are found too.  After each round noise, scatter and critical values are
     estimated afresh at the best point: those of a wrong model are wrong.  Where the misfit is within chance already, only
-    sets that are nearly as good as the best are extended.
+    sets that are as good as the best within chance are extended.
     """
     choice = _Choice(search, null, limits, null.fit.cost <= ADEQUATE * limits.misfit, ())
     front, far = [null], list[Candidate]()
     texts = ("one effect", "two effects", "three effects")
     for size in range(1, max_effects + 1):
         enough = choice.best.fit.cost <= choice.limits.misfit
-        if not enough and size > 1:
+        if enough and size > 1:
+            room = choice.limits.misfit - choice.limits.median
+            front = [c for c in front if c.penalised <= front[0].penalised + room]
+        elif size > 1:
             front += choice.search.refitted(far)
         needed = choice.limits.gain if enough else max(choice.limits.gain, WORTHWHILE * choice.best.fit.cost)
         worth = choice.best.penalised - 0.5 * needed
@@ -339,8 +345,8 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
 def _extended(search: Search, front: Sequence[Candidate], text: str, worth: float) -> list[Candidate]:
     """The front with one further effect each, best first.
 
-    Where the best set holds a smaller one that was not extended, that is extended too: the other effect of a pair may be
-    the right one though it was not among the best alone.
+    Where the best set holds a smaller one that was not extended, that is extended too: the other effect of a pair may
+    be the right one though it was not among the best alone.
     """
     names = list(search.sources)
     round_ = search.extend(front, names, text, worth)
@@ -548,13 +554,19 @@ def _identifiability_notes(best: Candidate) -> list[str]:
                     f"{a.name} and {b.name} cannot be told apart well with these data "
                     f"(correlation {correlation[i, j]:+.3f})"
                 )
-    far = [c.name for c, z in zip(best.fit.coordinates, best.fit.z, strict=True) if c.prior and abs(z) > 4.0]
-    if far:
-        notes.append(
-            f"{', '.join(far)} had to move by more than four standard deviations of what is usual: is the "
-            "nominal model that of this hand?"
-        )
     return notes
+
+
+def _moved_far(best: Candidate) -> str:
+    """A sentence on nominal parameters far from their values: this hand's, or an effect of the same form."""
+    far = [
+        f"{c.name} {c.value(float(z)):.3g} {c.unit} instead of {c.value(0.0):.3g}"
+        for c, z in zip(best.fit.coordinates, best.fit.z, strict=True)
+        if c.prior and abs(z) > FAR
+    ]
+    if not far:
+        return ""
+    return f" But it takes {', '.join(far)}, far outside the tolerance: is the nominal model that of this hand?"
 
 
 def _summary(
@@ -574,6 +586,7 @@ def _summary(
             f"Nothing is missing: with its own parameters fitted, the model's misfit {best.fit.cost:.0f} is below what "
             f"chance reaches ({limits.misfit:.0f}), and no effect of the catalogue gains more than chance would. "
             f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability."
+            + _moved_far(best)
         )
     names = " and ".join(e.title for e in effects)
     if verdict == "effects":
@@ -581,7 +594,7 @@ def _summary(
         if len(tied) > 1:
             others = "; ".join(" + ".join(names_) for names_ in tied[1:])
             tie = f" With these data it ties with: {others}."
-        return f"Missing: {names}. {fall}{tie}"
+        return f"Missing: {names}. {fall}{tie}{_moved_far(best)}"
     part = f" The catalogue comes nearest with {names}, which is not enough." if names else ""
     return (
         f"Something is missing that is not in the catalogue: the best model's misfit {best.fit.cost:.0f} stays above "

@@ -40,8 +40,8 @@ REFERENCE_SIZES = {"N.m": 0.05, "rad": 14.57, "V": 12.0, "A": 1.0, "s": 1.0}
 
 NARROW = 0.25
 LEAST = 0.01
-"""Relative tolerances up to the first are on a linear scale, down to this part of the nominal value: an effect that adds
-to the parameter then leaves a straight valley, along which a fit finds its way."""
+"""Relative tolerances up to the first are on a linear scale, down to this part of the nominal value: an effect that
+adds to the parameter then leaves a straight valley, along which a fit finds its way."""
 
 REMEMBERED = 48
 """Simulations whose signals are kept: those of a whole Jacobian of three trials."""

@@ -66,8 +66,8 @@ REFIT = 8
 """Extensions of a round that are refitted in closed loop."""
 
 PULLED = 4.0
-"""Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are refitted: it may have
-taken over an effect, which a scan does not see."""
+"""Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are refitted: it may
+have taken over an effect, which a scan does not see."""
 
 POLISH = 3
 """Extensions of a round that are refitted with all derivatives afresh."""
@@ -256,8 +256,7 @@ class Search:
 
     @staticmethod
     def _inside(z: Array, base: Fit) -> Array:
-        """The others within their bounds; nuisance parameters too, and not further off than eight standard deviations or
-        the base."""
+        """Within the bounds; nuisance parameters also within eight standard deviations, or as far off as the base."""
         bounds = np.array([c.bounds for c in base.coordinates]).reshape(-1, 2)
         for k, c in enumerate(base.coordinates):
             if c.prior:
