@@ -20,6 +20,7 @@ import argparse
 import contextlib
 import hashlib
 import importlib.util
+import inspect
 import io
 import json
 import sys
@@ -82,7 +83,9 @@ class Case:
 
     @property
     def key(self) -> str:
-        sources = "".join(f.read_text() for f in (Path(__file__), OUTSIDE, HERE / "sparse_terms.py"))
+        used = (FUNCTIONS[self.method], data, plain_problem, judged, _moved, _sparse, Case.entries)
+        sources = "".join(inspect.getsource(f) for f in used)
+        sources += OUTSIDE.read_text() + (HERE / "sparse_terms.py").read_text()
         text = json.dumps([asdict(self), code_hash(), sources], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:20]
 
@@ -166,10 +169,10 @@ def sysid(prepared: Prepared) -> dict[str, Any]:
             columns.append(problem.residual(prepared.model, values))
         return [np.column_stack(columns) if np.ndim(x) > 1 else columns[0]], [], []
 
-    # finite differences of the size that the roughness of dry friction needs
+    # finite differences as large as the lab's own: smaller ones see the roughness of dry friction
     with contextlib.redirect_stdout(io.StringIO()):  # its log of the iterations
         found, _ = toolbox.optimize(
-            wanted, residual, optimizer="mujoco", verbose=False, max_iters=30, eps=0.05
+            wanted, residual, optimizer="mujoco", verbose=False, max_iters=60, eps=0.5
         )
     z = np.asarray(found.as_vector(), dtype=np.float64)
     values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
