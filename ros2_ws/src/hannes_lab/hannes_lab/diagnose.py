@@ -304,8 +304,8 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
 
     Sets of one, two and three effects in turn; each round extends the best of the round before by every effect, so that
     two effects of which neither is best alone are found too.  After each round noise, scatter and critical values are
-    estimated afresh at the best point: those of a wrong model are wrong.  Where the misfit is within chance already, only
-    sets that are as good as the best within chance are extended.
+    estimated afresh at the best point: those of a wrong model are wrong.  Where the misfit is within chance already,
+    only sets that are as good as the best within chance are extended.
     """
     choice = _Choice(search, null, limits, null.fit.cost <= ADEQUATE * limits.misfit, ())
     front, far = [null], list[Candidate]()

@@ -125,11 +125,11 @@ def prepare(
     present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
     features = build_features(trials, present, rig.points)
     nuisances = tuple(rig.nuisances(model))
-    view = rig_for(rig, model) if surrogate else rig
-    problem = build_problem(view, features, model, nuisances, {})
     coordinates = [nuisance_coordinate(n) for n in nuisances]
+    view = rig_for(rig, model, coordinates) if surrogate else rig
+    problem = build_problem(view, features, model, nuisances, {})
     found = fit(problem, model, coordinates, {}, evaluations=15)
-    settled, found = settle(problem, found)
+    settled, found = settle(problem, found, renew=False)
     problem = build_problem(settled.rig, features, model, nuisances, found.values, problem.counts)
     notes = [f"{trial.name}: {note}" for trial in trials for note in trial.notes]
     if len(features.conditions) < 2:

@@ -31,7 +31,7 @@ from .problem import (
 from .rig import Nuisance
 from .settle import settle
 from .spectrum import position_periods
-from .surrogate import anchored_at
+from .surrogate import AnchoredRig, anchored_at
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -106,6 +106,11 @@ class Search:
         """The problem as seen from a fit: a slow plant's anchor is there."""
         return self.problem.with_rig(anchored_at(self.problem.rig, base.model, base.values))
 
+    @property
+    def slow(self) -> bool:
+        """True where a slow plant is seen through a fast one."""
+        return isinstance(self.problem.rig, AnchoredRig)
+
     # -- pieces -------------------------------------------------------------------------------------------------
     def effect(self, name: str) -> EffectType:
         return self.problem.rig.effect(load_effect(self.sources[name]))
@@ -117,9 +122,8 @@ class Search:
         return self.found[()]
 
     def _null(self) -> Candidate:
-        best = self._settle(
-            fit(self.problem, self.model, self.coordinates, {}, rows=self.rows, evaluations=25)
-        )
+        found = fit(self.problem, self.model, self.coordinates, {}, rows=self.rows, evaluations=25)
+        best = settle(self.problem, found, self.rows, renew=False)[1]
         return Candidate((), best, best.cost)
 
     def with_effects(self, names: Names) -> tuple[Model, tuple[Coordinate, ...]]:
@@ -157,12 +161,14 @@ class Search:
                 trials += [(dict((*shape, one)), one) for one in group]
         # The amplitudes of one wave, or the halves of a difference, are right together only.
         joint = list(itertools.product(*shapes)) if len(strengths) > 1 else []
-        problem = self.seen(base)
         scored: list[list[tuple[float, dict[str, float]]]] = []
         for point in (base, self.prior_point(base)):
             here = {c.name: float(z) for c, z in zip(point.coordinates, point.z, strict=True)}
+            problem = self.seen(point)
 
-            def at(start: Mapping[str, float], here: dict[str, float] = here) -> Array:
+            def at(
+                start: Mapping[str, float], here: dict[str, float] = here, problem: Problem = problem
+            ) -> Array:
                 z = {**here, **start}
                 return problem.residual(model, {c.name: c.value(z.get(c.name, 0.0)) for c in coordinates})
 
@@ -237,7 +243,7 @@ class Search:
                 [0.0 if c.prior else float(v) for c, v in zip(base.coordinates, base.z, strict=True)]
             )
             values = {c.name: c.value(float(v)) for c, v in zip(base.coordinates, z, strict=True)}
-            problem = self.seen(base)
+            problem = self.problem.with_rig(anchored_at(self.problem.rig, base.model, values))
             r = problem.residual(base.model, values)
             jacobian = finite_differences(problem, base.model, base.coordinates, z, r, range(z.size))
             self._prior_points[key] = Fit(base.model, base.coordinates, z, float(r @ r), r, jacobian)
@@ -273,31 +279,43 @@ class Search:
 
     def _add(self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None) -> Candidate:
         model, coordinates = self.with_effects((*base.names, name))
-        known = {c.name: base.fit.jacobian[:, j] for j, c in enumerate(base.fit.coordinates) if c.prior}
         if starts is None:
             starts = [start for _, start in self.starts(name, base.fit, model, coordinates, KEEP)]
-        problem = self.seen(base.fit)
-        tried = [
-            fit(
-                problem,
+        tried = []
+        for start in starts:
+            near = self._nearer(start, base.fit)
+            known = {c.name: near.jacobian[:, j] for j, c in enumerate(near.coordinates) if c.prior}
+            found = fit(
+                self.seen(near),
                 model,
                 coordinates,
                 self._true_start(base.fit, model, coordinates, start),
                 rows=self.rows,
-                known=known,
-                evaluations=10,
+                known={} if self.slow else known,
+                evaluations=15 if self.slow else 10,
             )
-            for start in starts
-        ]
+            # Costs that were seen from different places cannot be compared before the anchor is there.
+            tried.append(settle(self.problem, found, self.rows, moves=2, renew=False)[1])
         best = min(tried, key=lambda f: f.cost)
         if best.cost > base.fit.cost:
             # The set contains the base: the search was led astray, and starts again from where the base is.
             strengths = {f"{name}.{p.name}" for p in self.effect(name).parameters if p.vanishing is not None}
             here = {c.name: float(z) for c, z in zip(base.fit.coordinates, base.fit.z, strict=True)}
             at = {**starts[0], **here, **dict.fromkeys(strengths, 0.0)}
-            again = fit(problem, model, coordinates, at, rows=self.rows, evaluations=10)
+            again = fit(self.seen(base.fit), model, coordinates, at, rows=self.rows, evaluations=10)
             best = min(best, again, key=lambda f: f.cost)
         return self._keep(base, name, best)
+
+    def _nearer(self, start: Mapping[str, float], base: Fit) -> Fit:
+        """Where a fit from a start looks from: the base, or its nominal nuisance parameters if they are nearer.
+
+        A fast plant looks the same from everywhere.
+        """
+        if not self.slow:
+            return base
+        z = np.array([start.get(c.name, 0.0) for c in base.coordinates if c.prior])
+        there = np.array([v for c, v in zip(base.coordinates, base.z, strict=True) if c.prior])
+        return self.prior_point(base) if z @ z < (z - there) @ (z - there) else base
 
     def _true_start(
         self, base: Fit, model: Model, coordinates: Sequence[Coordinate], start: Mapping[str, float]
@@ -403,7 +421,7 @@ class Search:
         chosen = [
             (base, name, [s for _, s in starts])
             for k, ((base, name), starts) in enumerate(order)
-            if k < REFIT or base.pulled
+            if k < REFIT or (base.pulled and not self.slow)
         ]
         refitted = self.each(_add_in_worker, chosen, f"{text}: refit")
         for candidate in refitted:

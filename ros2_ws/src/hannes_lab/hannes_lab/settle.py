@@ -37,22 +37,21 @@ def settle(
     rows: NDArray[np.bool_] | None = None,
     *,
     moves: int = MOVES,
-    slopes: bool = True,
+    renew: bool = True,
 ) -> tuple[Problem, Fit]:
     """Fit, move the anchor to where the fit ends, and again until it stays there.
 
     Where the plant is fast already, nothing happens.  The returned problem is anchored at the returned fit.
 
-    slopes   take the slow plant's slopes along those coordinates along which they are not yet known
+    renew   take all slopes of the slow plant afresh, once, where a move does not lead down
     """
     if not isinstance(problem.rig, AnchoredRig):
         return problem, found
     problem, best = at_anchor(problem, found, rows)
-    if slopes:
-        problem = _sloped(problem, best, anew=False)
-    renewed = not slopes
+    problem = _sloped(problem, best, anew=False)
+    renewed = not renew
     for _ in range(moves):
-        new = fit(problem, best.model, best.coordinates, best.z, rows=rows, evaluations=8)
+        new = fit(problem, best.model, best.coordinates, best.z, rows=rows, evaluations=15)
         least = max(SETTLED, LITTLE * best.cost)
         if best.cost - new.cost < least:
             break

@@ -176,10 +176,13 @@ def repeated(known: Array, trial: Trial, size: int) -> Array:
     return known[:, np.minimum(index, known.shape[1] - 1)]
 
 
-def rig_for(rig: Rig, model: Model) -> Rig:
-    """The rig to search with: anchored where the model's plant is slow, else the rig itself."""
+def rig_for(rig: Rig, model: Model, coordinates: Sequence[Coordinate]) -> Rig:
+    """The rig to search with: the rig itself, or anchored at the nominal values where the model's plant is slow.
+
+    The slow plant's slopes along the coordinates are taken there: near to them is where the truth is expected.
+    """
     if model.plant in SLOW_PLANTS and isinstance(rig, PlantRig):
-        return AnchoredRig(rig, model, {})
+        return AnchoredRig(rig, model, {}).sloped(coordinates)
     return rig
 
 
