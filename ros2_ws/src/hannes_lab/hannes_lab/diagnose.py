@@ -30,7 +30,7 @@ from .prepare import Prepared
 from .problem import Problem, build_problem
 from .rig import Rig
 from .screen import usable_effects
-from .search import Candidate, Progress, Search, silent
+from .search import PENALTY, Candidate, Progress, Search, silent
 from .settle import slopes_at
 from .surrogate import exact_rig
 
@@ -323,7 +323,8 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         if not round_:
             break
         ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in round_)
-        if choice.best.fit.cost - round_[0].fit.cost < needed:
+        # What chance gains was found for effects of one free strength; further parameters pay their penalty.
+        if choice.best.penalised + PENALTY - round_[0].penalised < needed:
             choice = replace(choice, ranking=ranking)
             break
         new = choice.search.renewed(round_[0])

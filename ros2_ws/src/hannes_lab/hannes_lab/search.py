@@ -421,7 +421,7 @@ class Search:
         chosen = [
             (base, name, [s for _, s in starts])
             for k, ((base, name), starts) in enumerate(order)
-            if k < REFIT or (base.pulled and not self.slow)
+            if (k < REFIT or base.pulled) and (not self.slow or self._promising(k, base, starts[0][0], worth))
         ]
         refitted = self.each(_add_in_worker, chosen, f"{text}: refit")
         for candidate in refitted:
@@ -432,6 +432,11 @@ class Search:
         for candidate in polished:
             self.found[tuple(sorted(candidate.names))] = candidate
         return sorted([*polished, *ranked[len(polished) :]], key=lambda c: c.penalised)
+
+    @staticmethod
+    def _promising(rank: int, base: Candidate, scanned: float, worth: float) -> bool:
+        """Whether a refit on a slow plant can be worth its time: by its rank, and half the gain that is asked for."""
+        return rank == 0 or (rank < REFIT and scanned < 0.5 * (base.penalised + worth))
 
     def each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
         """function(search, *item) for every item, wherever the executor works; the same results everywhere.
