@@ -262,10 +262,10 @@ class HandRig(PlantRig):
             controller.parameters[:] = replace(controller.settings, **gains).to_array()
         return super().run(model, of_plant, trial, _moved(reference, delay, lead, trial))
 
-    def simulate(
+    def observed(
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
     ) -> dict[str, Array]:
-        """See Rig."""
+        """See PlantRig."""
         window = None if is_described(trial) else values.get(CURRENT_WINDOW)
         return self.logged(self.run(model, values, trial, reference), trial, window)
 

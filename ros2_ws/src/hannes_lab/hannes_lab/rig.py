@@ -236,10 +236,16 @@ class PlantRig:
         if key in self._signals:
             self._signals.move_to_end(key)
         else:
-            self._signals[key] = self.logged(self.run(model, values, trial, reference), trial)
+            self._signals[key] = self.observed(model, values, trial, reference)
             if len(self._signals) > REMEMBERED:
                 self._signals.popitem(last=False)
         return self._signals[key]
+
+    def observed(
+        self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
+    ) -> dict[str, Array]:
+        """Signals by name, simulated afresh."""
+        return self.logged(self.run(model, values, trial, reference), trial)
 
     def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
         """The rollout itself, with all that the plant can show."""

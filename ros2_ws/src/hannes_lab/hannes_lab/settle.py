@@ -12,13 +12,13 @@ from .problem import Problem
 from .rig import Rig
 from .surrogate import AnchoredRig, anchored_at
 
-MOVES = 4
+MOVES = 6
 """How often the anchor moves at most."""
 
 SETTLED = 1.0
 """The anchor stays where a further move lowers the cost by less than this, or by less than LITTLE of it."""
 
-LITTLE = 0.01
+LITTLE = 0.002
 
 
 def at_anchor(problem: Problem, found: Fit, rows: NDArray[np.bool_] | None) -> tuple[Problem, Fit]:
