@@ -52,6 +52,9 @@ HOPELESS = 10.0
 RIVAL = 2.0
 """Sets whose cost is at most so many times that of the best are judged beside it with the noise found at it."""
 
+FURTHER = 1.5
+"""Where all is explained within chance, a further effect must gain so many times what chance gains."""
+
 FAR = 4.0
 """Standard deviations of its prior at which a nominal parameter is called far off."""
 
@@ -323,8 +326,12 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         if not round_:
             break
         ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in round_)
+        if enough and size > 1 and round_[0].penalised < worth:
+            # The set without it may find its way further down from there; what is left is the gain.
+            choice = replace(choice, best=choice.search.without(choice.best, round_[0]))
         # What chance gains was found for effects of one free strength; further parameters pay their penalty.
-        if choice.best.penalised + PENALTY - round_[0].penalised < needed:
+        gain = choice.best.penalised + PENALTY - round_[0].penalised
+        if gain < needed * (FURTHER if enough and size > 1 else 1.0):
             choice = replace(choice, ranking=ranking)
             break
         new = choice.search.renewed(round_[0])

@@ -383,6 +383,15 @@ class Search:
         free = sum(1 for c in new.coordinates if not c.prior)
         return Candidate(candidate.names, new, new.cost + PENALTY * free)
 
+    def without(self, smaller: Candidate, larger: Candidate) -> Candidate:
+        """The smaller set fitted again from where the larger one ended, if that costs less."""
+        start = {c.name: float(z) for c, z in zip(larger.fit.coordinates, larger.fit.z, strict=True)}
+        old = smaller.fit
+        z = np.array([start.get(c.name, float(v)) for c, v in zip(old.coordinates, old.z, strict=True)])
+        moved = Candidate(smaller.names, replace(old, z=z), smaller.penalised)
+        again: Candidate = self.once(_refit_in_worker, moved, 15, text="refit")
+        return self._known(again) if again.fit.cost < old.cost else smaller
+
     def fitted(self, names: Names) -> Candidate:
         """The fit of a set: the known one, or one effect after the other."""
         found = self.null()
