@@ -10,6 +10,10 @@ from pathlib import Path
 
 import pytest
 
+# As the hannes command does, and before numpy is imported: sums in one order, the same numbers in every process.
+for _library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_library, "1")
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 DISCOVERY_PROFILE = REPOSITORY / "ros2_ws/src/hannes_bringup/hannes_bringup/config/fastdds.xml"

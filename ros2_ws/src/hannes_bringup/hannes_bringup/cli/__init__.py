@@ -8,6 +8,7 @@ failed, 2 wrong use or bad input (one line on stderr), 130 interrupted.
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +18,11 @@ import typer
 from hannes_description.errors import HannesError
 
 from .. import __version__
+
+# Read when numpy is imported, which the subcommands do: processes work side by side, and sums in one order give the
+# same numbers in every one of them.
+for _library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_library, "1")
 
 
 @dataclass(frozen=True)
