@@ -92,11 +92,19 @@ def write_set(
 def hannes(
     *words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> tuple[int, str, str]:
-    """Exit code, standard output (one line) and standard error of one command."""
+    """Exit code, standard output and standard error of one command."""
     monkeypatch.setattr("sys.argv", ["hannes", *words])
     try:
         code = main()
     except SystemExit as end:
         code = int(end.code or 0)
     said = capsys.readouterr()
-    return code, " ".join(said.out.split()), said.err
+    return code, said.out, said.err
+
+
+def hannes_in_one_line(
+    *words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> tuple[int, str, str]:
+    """The same with the output's lines joined: sentences may be broken anywhere."""
+    code, out, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    return code, " ".join(out.split()), err

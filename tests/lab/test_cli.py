@@ -4,21 +4,8 @@ import json
 from pathlib import Path
 
 import pytest
-from hannes_bringup.cli import main
 from hannes_description.model import Model
-
-
-def hannes(
-    *words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of one command."""
-    monkeypatch.setattr("sys.argv", ["hannes", *words])
-    try:
-        code = main()
-    except SystemExit as end:
-        code = int(end.code or 0)
-    said = capsys.readouterr()
-    return code, said.out, said.err
+from lab.foreign_bags import hannes
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hannes_description.joints import RAD_PER_COUNT
-from lab.foreign_bags import Damage, Signals, hannes, signals_of_set, write_bag, write_set
+from lab.foreign_bags import Damage, Signals, hannes_in_one_line, signals_of_set, write_bag, write_set
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 
@@ -97,7 +97,9 @@ def test_it_works_through_and_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bags = write_set(tmp_path / "bags", slow, damage)
-    code, out, err = hannes("compare", str(bags), "--fitted", capsys=capsys, monkeypatch=monkeypatch)
+    code, out, err = hannes_in_one_line(
+        "compare", str(bags), "--fitted", capsys=capsys, monkeypatch=monkeypatch
+    )
     assert code == 0, err
     assert said in out
     assert float(out.split("Overall error: ")[1].split()[0]) < 5.0
@@ -122,7 +124,9 @@ def test_what_cannot_be_used_is_one_clear_error(
 ) -> None:
     bags = write_set(tmp_path / "bags", slow, damage)
     for command in (("compare",), ("diagnose",), ("add", "--effect", "wire_slack"), ("report",)):
-        code, _, err = hannes(command[0], str(bags), *command[1:], capsys=capsys, monkeypatch=monkeypatch)
+        code, _, err = hannes_in_one_line(
+            command[0], str(bags), *command[1:], capsys=capsys, monkeypatch=monkeypatch
+        )
         assert code == 2 and said in err and len(err.strip().splitlines()) == 1
 
 
@@ -134,10 +138,12 @@ def test_a_factor_of_ones_own(
 ) -> None:
     bags = write_set(tmp_path / "bags", slow, scaled(encoder_position=-3.8))
     words = ("compare", str(bags), "--fitted", "--scale", f"encoder_position={-1 / 3.8}")
-    code, out, _ = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    code, out, _ = hannes_in_one_line(*words, capsys=capsys, monkeypatch=monkeypatch)
     assert code == 0 and "as --scale says" in out
     for wrong, said in (("encoder_position=x", "a number"), ("encoder=2", "unknown signal")):
-        code, _, err = hannes("compare", str(bags), "--scale", wrong, capsys=capsys, monkeypatch=monkeypatch)
+        code, _, err = hannes_in_one_line(
+            "compare", str(bags), "--scale", wrong, capsys=capsys, monkeypatch=monkeypatch
+        )
         assert code == 2 and said in err
 
 
@@ -150,7 +156,9 @@ def test_stamps_of_another_clock(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bags = write_set(tmp_path / "bags", slow, clock=clock)
-    code, out, _ = hannes("compare", str(bags), "--fitted", capsys=capsys, monkeypatch=monkeypatch)
+    code, out, _ = hannes_in_one_line(
+        "compare", str(bags), "--fitted", capsys=capsys, monkeypatch=monkeypatch
+    )
     assert code == 0 and "different clocks" in out
     assert float(out.split("Overall error: ")[1].split()[0]) < 5.0
 
@@ -164,7 +172,9 @@ def test_different_rates_and_storages_in_one_set(
     fast = signals_of_set(sensors="bench", conditions=("fast",))["fast"]
     write_bag(tmp_path / "slow", good["slow"])
     write_bag(tmp_path / "fast", fast, sqlite=True)
-    code, out, _ = hannes("compare", str(tmp_path), "--fitted", capsys=capsys, monkeypatch=monkeypatch)
+    code, out, _ = hannes_in_one_line(
+        "compare", str(tmp_path), "--fitted", capsys=capsys, monkeypatch=monkeypatch
+    )
     assert code == 0 and float(out.split("Overall error: ")[1].split()[0]) < 6.0
     assert "motor_voltage is recorded only in fast" in out
 
@@ -175,12 +185,16 @@ def test_empty_bags(
     for name, plugin in (("mcap", StoragePlugin.MCAP), ("sqlite", StoragePlugin.SQLITE3)):
         with Writer(tmp_path / name, version=9, storage_plugin=plugin):
             pass
-        code, _, err = hannes("compare", str(tmp_path / name), capsys=capsys, monkeypatch=monkeypatch)
+        code, _, err = hannes_in_one_line(
+            "compare", str(tmp_path / name), capsys=capsys, monkeypatch=monkeypatch
+        )
         assert code == 2 and "holds no message" in err
     (tmp_path / "zero").mkdir()
     (tmp_path / "zero" / "zero.mcap").write_bytes(b"")
     for path in ("zero", "zero/zero.mcap"):
-        code, _, err = hannes("compare", str(tmp_path / path), capsys=capsys, monkeypatch=monkeypatch)
+        code, _, err = hannes_in_one_line(
+            "compare", str(tmp_path / path), capsys=capsys, monkeypatch=monkeypatch
+        )
         assert code == 2 and "hannes recover" in err
 
 
@@ -189,5 +203,5 @@ def test_hide_lists_its_conditions(
 ) -> None:
     from hannes_lab.hide import CONDITIONS
 
-    _, out, _ = hannes("hide", "--help", capsys=capsys, monkeypatch=monkeypatch)
+    _, out, _ = hannes_in_one_line("hide", "--help", capsys=capsys, monkeypatch=monkeypatch)
     assert all(name in out for name in CONDITIONS)

@@ -12,7 +12,7 @@ from hannes_lab.own_effect import check_own_effects
 from hannes_lab.prepare import prepare
 from hannes_lab.problem import FAILED
 from hannes_lab.trials import make_trial
-from lab.foreign_bags import Signals, hannes, signals_of_set, write_set
+from lab.foreign_bags import Signals, hannes_in_one_line, signals_of_set, write_set
 
 EFFECT = '''
 import math
@@ -74,7 +74,7 @@ def test_a_bad_effect_is_one_clear_error(
         ("diagnose", str(bags), "--effect", source),
         ("hide", str(out), "--truth", str(truth), "--effect", source),
     ):
-        code, _, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+        code, _, err = hannes_in_one_line(*words, capsys=capsys, monkeypatch=monkeypatch)
         assert code == 2 and said in err and len(err.strip().splitlines()) == 1
     assert not out.exists() and not truth.exists()
 

@@ -304,7 +304,7 @@ class Search:
             at = {**starts[0], **here, **dict.fromkeys(strengths, 0.0)}
             again = fit(self.seen(base.fit), model, coordinates, at, rows=self.rows, evaluations=10)
             best = min(best, again, key=lambda f: f.cost)
-        return self._keep(base, name, best)
+        return _candidate((*base.names, name), best)
 
     def _nearer(self, start: Mapping[str, float], base: Fit) -> Fit:
         """Where a fit from a start looks from: the base, or its nominal nuisance parameters if they are nearer.
@@ -334,10 +334,6 @@ class Search:
             costs.append(float(r @ r) + sum(one.get(c.name, 0.0) ** 2 for c in coordinates if c.prior))
         return start if costs[0] <= costs[1] else kept
 
-    def _keep(self, base: Candidate, name: str, best: Fit) -> Candidate:
-        free = sum(1 for c in best.coordinates if not c.prior)
-        return Candidate((*base.names, name), best, best.cost + PENALTY * free)
-
     def _known(self, candidate: Candidate) -> Candidate:
         self.found[tuple(sorted(candidate.names))] = candidate
         return candidate
@@ -348,16 +344,17 @@ class Search:
         return self._known(found)
 
     def _polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
-        old = candidate.fit
-        new = self._settle(
-            fit(self.seen(old), old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
-        )
-        if new.cost < old.cost:
-            candidate = Candidate(candidate.names, new, candidate.penalised - old.cost + new.cost)
+        new = self._again(candidate.fit, evaluations)
+        if new.cost < candidate.fit.cost:
+            cost = candidate.penalised - candidate.fit.cost + new.cost
+            candidate = Candidate(candidate.names, new, cost)
         return candidate
 
-    def _settle(self, found: Fit) -> Fit:
-        """The fit carried on to the slow plant itself, where there is one."""
+    def _again(self, old: Fit, evaluations: int) -> Fit:
+        """A fit from where another ended, carried on to the slow plant itself where there is one."""
+        found = fit(
+            self.seen(old), old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations
+        )
         return settle(self.problem, found, self.rows)[1]
 
     def renewed(self, best: Candidate) -> Search:
@@ -370,18 +367,9 @@ class Search:
             problem, self.model, self.nuisances, self.sources, self.executor, self.progress, self.rows
         )
 
-    def refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
-        """A candidate of another problem (other noise), fitted in this one from its point."""
-        found: Candidate = self.once(_refit_in_worker, candidate, evaluations, text="refit")
-        return self._known(found)
-
     def _refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
-        old = candidate.fit
-        new = self._settle(
-            fit(self.seen(old), old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations)
-        )
-        free = sum(1 for c in new.coordinates if not c.prior)
-        return Candidate(candidate.names, new, new.cost + PENALTY * free)
+        """A candidate of another problem (other noise), fitted in this one from its point."""
+        return _candidate(candidate.names, self._again(candidate.fit, evaluations))
 
     def without(self, smaller: Candidate, larger: Candidate) -> Candidate:
         """The smaller set fitted again from where the larger one ended, if that costs less."""
@@ -404,10 +392,7 @@ class Search:
         """Candidates of another problem, each fitted in this one unless it was already."""
         todo = [c for c in candidates if self.found.get(tuple(sorted(c.names))) is not c]
         done = iter(self.each(_refit_in_worker, [(c, 8) for c in todo], "noise afresh: refit"))
-        out = [next(done) if c in todo else c for c in candidates]
-        for c in out:
-            self.found[tuple(sorted(c.names))] = c
-        return out
+        return [self._known(next(done) if c in todo else c) for c in candidates]
 
     # -- rounds -------------------------------------------------------------------------------------------------
     def extend(
@@ -432,14 +417,10 @@ class Search:
             for k, ((base, name), starts) in enumerate(order)
             if (k < REFIT or base.pulled) and (not self.slow or self._promising(k, base, starts[0][0], worth))
         ]
-        refitted = self.each(_add_in_worker, chosen, f"{text}: refit")
-        for candidate in refitted:
-            self.found[tuple(sorted(candidate.names))] = candidate
+        refitted = [self._known(c) for c in self.each(_add_in_worker, chosen, f"{text}: refit")]
         ranked = sorted(refitted, key=lambda c: c.penalised)
         worthy = [(c,) for c in ranked[:POLISH] if c.penalised < worth]
-        polished = self.each(_polish_in_worker, worthy, f"{text}: polish")
-        for candidate in polished:
-            self.found[tuple(sorted(candidate.names))] = candidate
+        polished = [self._known(c) for c in self.each(_polish_in_worker, worthy, f"{text}: polish")]
         return sorted([*polished, *ranked[len(polished) :]], key=lambda c: c.penalised)
 
     @staticmethod
@@ -562,6 +543,11 @@ def _work(
     counts.simulations = counts.failures = 0
     result = function(search, *item)
     return result, counts.simulations, counts.failures
+
+
+def _candidate(names: Names, found: Fit) -> Candidate:
+    """A fitted set with what its free parameters cost."""
+    return Candidate(names, found, found.cost + PENALTY * sum(not c.prior for c in found.coordinates))
 
 
 def _point_of(base: Fit) -> tuple[Names, bytes]:
