@@ -121,6 +121,7 @@ def run_case(case: Case) -> dict[str, Any]:
         "tied": [sorted(t) for t in found.tied],
         "inside": inside,
         "costs": dict(found.costs),
+        "falls": [[f.added, f.held_out, dict(f.by_condition)] for f in found.falls],
         "final": found.falls[-1].held_out,
         "nominal": found.falls[0].held_out,
         "seconds": time.monotonic() - start,

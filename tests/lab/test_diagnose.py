@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from hannes_description.model import Model
 from hannes_lab.add import add_effects
+from hannes_lab.chance import chance
 from hannes_lab.compare import compare
-from hannes_lab.diagnose import Diagnosis, diagnose, effect_sources
+from hannes_lab.diagnose import Diagnosis, _Choice, _pruned, diagnose, effect_sources
 from hannes_lab.hide import Truth, make_set
 from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.search import Search
 from hannes_lab.trials import make_trial
 from hannes_sim.effect import load_effect, strength_of
 
@@ -72,6 +74,32 @@ def test_a_hidden_effect_is_named_its_parameter_recovered_and_the_error_falls(
     held_out = [fall.held_out for fall in found.falls]
     assert held_out[-1] <= 1.3 < held_out[0]
     assert held_out[-1] < held_out[1], "more than the nuisance parameters must be gained"
+
+
+def test_friction_within_reach_of_the_tolerance_is_no_effect_but_is_pointed_at() -> None:
+    """0.0125 N.m more is little over three standard deviations of the hand's own friction: a reader must see it."""
+    prepared, _ = data(["coulomb_friction"], seed=3004, factor=1.25)
+    only = effect_sources(only=["coulomb_friction", "viscous_friction", "gravity"])
+    found = diagnose(prepared, only)
+    assert found.verdict == "nothing"
+    assert found.nuisances["friction.coulomb"]["prior_sds"] > 3.0
+    assert "But it takes friction.coulomb" in found.summary
+
+
+def test_an_effect_that_a_later_one_made_superfluous_is_dropped() -> None:
+    prepared, _ = data(["glove_stiffness"], seed=102)
+    search = Search(
+        prepared.problem,
+        prepared.model,
+        prepared.nuisances,
+        effect_sources(only=["glove_stiffness", "gravity", "wire_slack"]),
+    )
+    null = search.null()
+    limits = chance(search.problem, null.fit, search.signatures(null))
+    both = search.fitted(("gravity", "glove_stiffness"))
+    kept = _pruned(_Choice(search, both, limits, True, ()))
+    assert kept.best.names == ("glove_stiffness",)
+    assert kept.best.penalised < both.penalised + limits.gain
 
 
 @pytest.mark.timeout(1200)  # the longest search: every round is tried before the answer is "unknown"

@@ -191,7 +191,7 @@ def run_hannes(words: list[str], cache: Path, **options: object) -> "subprocess.
 
 
 @pytest.mark.timeout(600)
-def test_ctrl_c_after_the_first_round_and_the_same_command_goes_on(recordings: Path, tmp_path: Path) -> None:
+def test_ctrl_c_in_the_first_round_and_the_same_command_goes_on(recordings: Path, tmp_path: Path) -> None:
     only = [word for name in ONLY for word in ("--only", name)]
     words = ["diagnose", str(recordings), *only, "--json", "--jobs", "2"]
     whole = run_hannes([*words, "--no-cache"], tmp_path / "none")
@@ -202,8 +202,8 @@ def test_ctrl_c_after_the_first_round_and_the_same_command_goes_on(recordings: P
 
     process = run_hannes(words, tmp_path / "cache")
     kept = tmp_path / "cache" / "hannes" / "lab"
-    round_one = 2 + 3 + 3  # the nominal fit, its nominal values, and three signatures and scans at least
-    while process.poll() is None and (not kept.exists() or len(list(kept.glob("*.npz"))) < round_one):
+    begun = 3  # the nominal fit and what chance reaches: far from the end, also on a busy machine
+    while process.poll() is None and (not kept.exists() or len(list(kept.glob("*.npz"))) < begun):
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)  # what Ctrl-C does: to the workers as well
     out, err = process.communicate()

@@ -38,10 +38,13 @@ Array = NDArray[np.float64]
 
 ADEQUATE = 1.25
 """A set of effects is adequate if its cost is at most this multiple of what chance reaches: room for the linear
-approximation behind the critical value."""
+approximation behind the critical value.  Where the model has an error of its own, whose width has room enough, 1."""
 
 WORTHWHILE = 0.05
 """A further effect must remove at least this part of the cost, and of the error on held-out conditions."""
+
+OWN_ERROR_PART = 0.1
+"""The same where the model has an error of its own, also within chance: its width is assumed, and it is not noise."""
 
 TIE = 12.0
 """Sets whose penalised costs differ by less cannot be told apart: a likelihood ratio of e^6."""
@@ -55,7 +58,7 @@ RIVAL = 2.0
 FURTHER = 1.5
 """Where all is explained within chance, a further effect must gain so many times what chance gains."""
 
-FAR = 4.0
+FAR = 3.0
 """Standard deviations of its prior at which a nominal parameter is called far off."""
 
 MAX_EFFECTS = 3
@@ -291,7 +294,7 @@ def _grow(search: Search, null: Candidate, limits: Chance, max_effects: int) -> 
     """Effects one after another while the error on held-out conditions falls by at least WORTHWHILE."""
     grown = grow(search, null, max_effects, WORTHWHILE)
     cost = grown.best.fit.cost
-    adequate = cost <= ADEQUATE * limits.misfit
+    adequate = _adequate(search, grown.best, limits)
     ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in grown.first)
     notes = list(grown.notes)
     if not adequate:
@@ -310,7 +313,7 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
     estimated afresh at the best point: those of a wrong model are wrong.  Where the misfit is within chance already,
     only sets that are as good as the best within chance are extended.
     """
-    choice = _Choice(search, null, limits, null.fit.cost <= ADEQUATE * limits.misfit, ())
+    choice = _Choice(search, null, limits, _adequate(search, null, limits), ())
     front, far = [null], list[Candidate]()
     texts = ("one effect", "two effects", "three effects")
     for size in range(1, max_effects + 1):
@@ -320,18 +323,18 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
             front = [c for c in front if c.penalised <= front[0].penalised + room]
         elif size > 1:
             front += choice.search.refitted(far)
-        needed = choice.limits.gain if enough else max(choice.limits.gain, WORTHWHILE * choice.best.fit.cost)
+        needed = _needed(choice, choice.best, first=size == 1)
         worth = choice.best.penalised - 0.5 * needed
         round_ = _extended(choice.search, front, texts[size - 1], worth)
         if not round_:
             break
         ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in round_)
-        if enough and size > 1 and round_[0].penalised < worth:
+        if enough and round_[0].penalised < worth:
             # The set without it may find its way further down from there; what is left is the gain.
-            choice = replace(choice, best=choice.search.without(choice.best, round_[0]))
+            choice = replace(choice, best=choice.search.without(round_[0], choice.best.names))
         # What chance gains was found for effects of one free strength; further parameters pay their penalty.
         gain = choice.best.penalised + PENALTY - round_[0].penalised
-        if gain < needed * (FURTHER if enough and size > 1 else 1.0):
+        if gain < needed:
             choice = replace(choice, ranking=ranking)
             break
         new = choice.search.renewed(round_[0])
@@ -345,8 +348,36 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         best = new.polish(near[0])
         limits_new = chance(new.problem, best.fit, new.signatures(best))
         close = tuple(c for c in near[1:] if c.penalised <= best.penalised + TIE)
-        choice = _Choice(new, best, limits_new, best.fit.cost <= ADEQUATE * limits_new.misfit, ranking, close)
+        adequate = _adequate(new, best, limits_new)
+        choice = _Choice(new, best, limits_new, adequate, ranking, close)
         front, far = [best, *near[1:]], [c for c in wide if c not in rivals]
+    return _pruned(choice)
+
+
+def _adequate(search: Search, candidate: Candidate, limits: Chance) -> bool:
+    return candidate.fit.cost <= limits.misfit * (1.0 if search.problem.discrepancy else ADEQUATE)
+
+
+def _needed(choice: _Choice, base: Candidate, *, first: bool = False) -> float:
+    """By how much a further effect must lower the penalised cost of a base; `first`: the base has none."""
+    limits = choice.limits
+    enough = base.fit.cost <= limits.misfit
+    part = OWN_ERROR_PART if choice.search.problem.discrepancy else 0.0 if enough else WORTHWHILE
+    return max(limits.gain, part * base.fit.cost) * (FURTHER if enough and not first else 1.0)
+
+
+def _pruned(choice: _Choice) -> _Choice:
+    """Without what a later effect made superfluous: sets grow one by one, and an early one may be a stopgap."""
+    while choice.adequate and len(choice.best.names) > 1:
+        best = choice.best
+        parts = [
+            choice.search.without(best, tuple(n for n in best.names if n != name)) for name in best.names
+        ]
+        part = min(parts, key=lambda c: c.penalised)
+        gain = part.penalised + PENALTY - best.penalised
+        if gain >= _needed(choice, part) or not _adequate(choice.search, part, choice.limits):
+            break
+        choice = replace(choice, best=part, rivals=())
     return choice
 
 
@@ -574,7 +605,10 @@ def _moved_far(best: Candidate) -> str:
     ]
     if not far:
         return ""
-    return f" But it takes {', '.join(far)}, far outside the tolerance: is the nominal model that of this hand?"
+    return (
+        f" But it takes {', '.join(far)}, far outside the tolerance: is the nominal model that of this hand, or is "
+        "there an effect of the same form?"
+    )
 
 
 def _summary(

@@ -59,12 +59,8 @@ after or before it was filtered."""
 
 CURRENT_WINDOW = "log.current_window"
 
-_RATE_OVER = 0.01
-_SMOOTHED = 0.03
-"""s; a reference that comes by messages has a rate only over one or several of them."""
-
-OWN_ERROR: Mapping[str, float] = {"encoder_position": 0.003}
-OWN_ERROR_DRIVE = 0.02
+OWN_ERROR: Mapping[str, float] = {"encoder_position": 0.0022}
+OWN_ERROR_DRIVE = 0.015
 """Of a signal's span: how far the form of the model may be from that of a hand that is not this simulator's.  The loop
 holds the position; what the model does not know shows in what drives it."""
 
@@ -80,9 +76,6 @@ LEAD_SEEN = 0.02
 _RATE_OVER = 0.01
 _SMOOTHED = 0.03
 """s; a reference that comes by messages has a rate only over one or several of them."""
-
-UNKNOWN_DISCREPANCY = 0.01
-"""Of a signal's span: how far the form of the model may be from a hand that is not this simulator's."""
 
 
 def object_of(trial: Trial) -> GraspObject | None:

@@ -371,14 +371,15 @@ class Search:
         """A candidate of another problem (other noise), fitted in this one from its point."""
         return _candidate(candidate.names, self._again(candidate.fit, evaluations))
 
-    def without(self, smaller: Candidate, larger: Candidate) -> Candidate:
-        """The smaller set fitted again from where the larger one ended, if that costs less."""
+    def without(self, larger: Candidate, names: Names) -> Candidate:
+        """A part of a set, fitted again from where the larger one ended, or its known fit if that costs less."""
         start = {c.name: float(z) for c, z in zip(larger.fit.coordinates, larger.fit.z, strict=True)}
-        old = smaller.fit
-        z = np.array([start.get(c.name, float(v)) for c, v in zip(old.coordinates, old.z, strict=True)])
-        moved = Candidate(smaller.names, replace(old, z=z), smaller.penalised)
-        again: Candidate = self.once(_refit_in_worker, moved, 15, text="refit")
-        return self._known(again) if again.fit.cost < old.cost else smaller
+        model, coordinates = self.with_effects(names)
+        z = np.array([start[c.name] for c in coordinates])
+        there = replace(larger.fit, model=model, coordinates=coordinates, z=z)
+        again: Candidate = self.once(_refit_in_worker, Candidate(names, there, np.inf), 15, text="without it")
+        known = self.found.get(tuple(sorted(names)))
+        return known if known is not None and known.fit.cost <= again.fit.cost else self._known(again)
 
     def fitted(self, names: Names) -> Candidate:
         """The fit of a set: the known one, or one effect after the other."""
