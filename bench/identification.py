@@ -8,6 +8,9 @@ interrupted run goes on where it stopped.  The seeds differ from those on which 
     single    one effect of the catalogue at 1.5, 2, 3, 5 and 8 times its detection limit
     pairs     two effects at three times their limits
     outside   effects of bench/outside_effects.py
+    typical   every effect at its typical strength
+    logging   LOGGED at typical strength, with other loggers: 100 Hz, position alone, current alone
+    mismatch  made by the MuJoCo plant, fitted by the reduced one
 """
 
 from __future__ import annotations
@@ -35,7 +38,23 @@ from hannes_lab.trials import make_trial
 from hannes_sim.effect import catalogue, effect_source, load_effect
 from joblib import Parallel, delayed
 
-SETS = ("nothing", "single", "pairs", "outside")
+SETS = ("nothing", "single", "pairs", "outside", "typical", "logging", "mismatch")
+LOGGED = (
+    "viscous_friction",
+    "load_dependent_friction",
+    "glove_stiffness",
+    "wire_slack",
+    "gearbox_inertia",
+    "command_delay",
+    "winding_heating",
+    "encoder_eccentricity",
+)
+LOGGERS = {
+    "100 Hz, signed": ("bench", ()),
+    "position alone": ("thesis", ("encoder_position",)),
+    "current alone": ("thesis", ("motor_current",)),
+}
+"""Name of the loggers of `hide`, and the signals that take part (all if none are named)."""
 FACTORS = (1.5, 2.0, 3.0, 5.0, 8.0)
 JUDGING_SEED = 50_000
 """First seed of the sets that are judged; thresholds are set on seeds below."""
@@ -59,6 +78,8 @@ class Case:
     seed: int
     closures: int = 13
     sensors: str = "thesis"
+    signals: tuple[str, ...] = ()
+    made_by: str = "nominal"
 
     @property
     def key(self) -> str:
@@ -95,10 +116,10 @@ def run_case(case: Case) -> dict[str, Any]:
     """Make the set, diagnose it blind, and compare with the truth."""
     model = Model.load()
     recordings, truth = make_set(
-        model, case.entries(), seed=case.seed, closures=case.closures, sensors=case.sensors
+        Model.load(case.made_by), case.entries(), seed=case.seed, closures=case.closures, sensors=case.sensors
     )
     start = time.monotonic()
-    prepared = prepare([make_trial(r) for r in recordings], model)
+    prepared = prepare([make_trial(r) for r in recordings], model, signals=case.signals or None)
     found = diagnose(prepared, effect_sources(model=model))
     hidden = sorted(e.name for e in truth.effects)
     named = sorted(e.name for e in found.effects)
@@ -116,6 +137,7 @@ def run_case(case: Case) -> dict[str, Any]:
         "hidden": hidden,
         "factor": case.factor,
         "seed": case.seed,
+        "loggers": next((n for n, given in LOGGERS.items() if given == (case.sensors, case.signals)), "30 Hz"),
         "verdict": found.verdict,
         "named": named,
         "tied": [sorted(t) for t in found.tied],
@@ -201,6 +223,20 @@ def cases(kinds: list[str], limits: dict[str, float], quick: bool, first: int = 
             out.append(
                 Case("outside", ((source, strength(source, factor)),), factor, first + 30_000 + k)
             )
+    typical = [(name, strength(name, min(1.0, highest_factor(name)))) for name in names]
+    if "typical" in kinds:
+        out += [Case("typical", (one,), 1.0, first + 40_000 + k) for k, one in enumerate(typical)]
+    if "logging" in kinds:
+        for k, (one, (sensors, signals)) in enumerate(
+            itertools.product((t for t in typical if t[0] in LOGGED), LOGGERS.values())
+        ):
+            out.append(Case("logging", (one,), 1.0, first + 50_000 + k, sensors=sensors, signals=signals))
+    if "mismatch" in kinds:
+        chosen = [(), *((t,) for t in typical if t[0] in LOGGED[:4])]
+        out += [
+            Case("mismatch", effects, 1.0, first + 60_000 + k, made_by="nominal_mujoco")
+            for k, effects in enumerate(chosen)
+        ]
     return out
 
 
@@ -210,6 +246,9 @@ def table(results: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
 
     def share(part: list[Any], whole: list[Any]) -> str:
         return f"{len(part)} of {len(whole)} ({100.0 * len(part) / len(whole):.0f} %)" if whole else "-"
+
+    def named(part: list[dict[str, Any]]) -> str:
+        return share([r for r in part if r["hidden"] in (r["tied"] or [r["named"]])], part)
 
     nothing = [r for r in results if r["kind"] == "nothing"]
     single = [r for r in results if r["kind"] == "single"]
@@ -279,7 +318,19 @@ def table(results: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
                 "90 %",
             )
         )
-    added = [r for r in results if r["verdict"] == "effects"]
+    typical = [r for r in results if r["kind"] == "typical"]
+    if typical:
+        exact = [r for r in typical if r["named"] == r["hidden"]]
+        rows.append(("one hidden at typical strength: named exactly", share(exact, typical), ""))
+        rows.append(("one hidden at typical strength: named, or in a tie", named(typical), ""))
+    for loggers in LOGGERS:
+        part = [r for r in results if r["kind"] == "logging" and r["loggers"] == loggers]
+        if part:
+            rows.append((f"{loggers}: named, or in a tie", named(part), ""))
+    mismatch = [r for r in results if r["kind"] == "mismatch"]
+    if mismatch:
+        rows.append(("made by MuJoCo, fitted by the reduced plant: as hidden", named(mismatch), ""))
+    added = [r for r in results if r["verdict"] == "effects" and r["kind"] not in ("logging", "mismatch")]
     if added:
         rows.append(
             (
