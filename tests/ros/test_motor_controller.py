@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import signal
+import subprocess
+import sys
 from collections.abc import Mapping
 
 import numpy as np
@@ -149,6 +152,23 @@ def test_real_time_goes_to_zero_volt_when_the_state_stops(peer):
         peer.say("encoder_position", state_bytes(1_000_000_000, 1.0))  # a stamp of long ago
         peer.until_status(NAME, lambda s: int(s["rejected_states"]) == before + 1, "the old stamp counted")
         assert voltages(peer)[-1] == 0.0
+
+
+def test_hannes_motor_switches_a_running_controller(peer):
+    def motor(*words: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "hannes_bringup.cli", "motor", "--json", *words]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    with processes(NodeProcess(NAME, clock="lockstep", autostart=False)):
+        announce(peer)
+        name = ("--node", f"{peer.node.get_namespace().rstrip('/')}/{NAME}")
+        for wanted, state in (((), "unconfigured"), (("on",), "active"), (("off",), "inactive"), (("on",), "active")):
+            asked = motor(*wanted, *name)
+            assert asked.returncode == 0, asked.stderr
+            assert json.loads(asked.stdout)["state"] == state
+    nobody = motor("on", "--node", "/nobody/there", "--timeout", "0.5")
+    assert nobody.returncode == 2
+    assert nobody.stderr.count("\n") == 1 and "No lifecycle node '/nobody/there'" in nobody.stderr
 
 
 def without_command(status: Mapping[str, str]) -> bool:

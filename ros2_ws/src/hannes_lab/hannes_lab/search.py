@@ -303,6 +303,7 @@ class Search:
             here = {c.name: float(z) for c, z in zip(base.fit.coordinates, base.fit.z, strict=True)}
             at = {**starts[0], **here, **dict.fromkeys(strengths, 0.0)}
             again = fit(self.seen(base.fit), model, coordinates, at, rows=self.rows, evaluations=10)
+            again = settle(self.problem, again, self.rows, moves=2, renew=False)[1]
             best = min(best, again, key=lambda f: f.cost)
         return _candidate((*base.names, name), best)
 

@@ -38,6 +38,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("demo", "hannes_bringup.cli.demo:demo", "The whole way once: graph, bags, comparison, diagnosis, report."),
     Command("run", "hannes_bringup.cli.run:app", "Start the whole node graph, or one node."),
     Command("nodes", "hannes_bringup.cli.nodes:nodes", "Show what is running: nodes, topics, rates, ages."),
+    Command("motor", "hannes_bringup.cli.motor:motor", "Switch the motor of a running hand on or off."),
     Command(
         "record", "hannes_bringup.cli.bags:record", "Record the topics of the hand into a crash-safe bag."
     ),
