@@ -1,5 +1,7 @@
 """A slow plant seen through the fast one: exact at the anchor, right to first order around it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hannes_description.model import Model
@@ -51,6 +53,18 @@ def test_slopes_of_the_slow_plant_make_it_right_around_the_anchor(rig, trial):
     bare = AnchoredRig(rig.exact, FULL, {})
     wrong = np.linalg.norm(simulated(bare, trial, values) - true)
     assert np.linalg.norm(simulated(rig, trial, values) - true) < 0.5 * wrong
+
+
+@pytest.mark.parametrize("model", [FULL, Model.load()], ids=lambda m: m.plant)
+def test_what_is_unknown_of_a_recording_of_others_can_be_moved_on_every_plant(trial, model):
+    strange = replace(trial, options={"object": "soft"})
+    rig = HandRig([strange])
+    unknown = rig.nuisances(model)
+    assert {"control.kp", "log.current_window"} < {n.name for n in unknown}
+    for nuisance in unknown:
+        moved = {nuisance.name: nuisance_coordinate(nuisance).value(0.5)}
+        run = rig.simulate(model, moved, strange, strange.reference[:300])
+        assert all(np.isfinite(signal).all() for signal in run.values()), nuisance.name
 
 
 def test_later_closures_repeat_the_second(trial):

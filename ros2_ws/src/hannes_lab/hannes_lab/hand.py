@@ -199,7 +199,8 @@ class HandRig(PlantRig):
                 for name, sd in _UNKNOWN_GAINS.items()
                 if means[name] > 0.0
             ]
-        if strange and _WIRE in self._plant(model.without_effects(), strange[0])[0].names:
+        known = self._plant(model.without_effects(), strange[0])[0].names if strange else ()
+        if _WIRE in known and model.parameters.value(_WIRE) > 0.0:
             unit = model.parameters[_WIRE].unit
             out.append(Nuisance(_WIRE, model.parameters.value(_WIRE), _UNKNOWN_WIRE_SD, True, unit=unit))
         logged = [t.signals["motor_current"][0] for t in strange if "motor_current" in t.signals]
