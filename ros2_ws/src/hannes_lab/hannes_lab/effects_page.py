@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
-from hannes_sim.effect import EffectType, effect_source, load_effect
+from hannes_sim.effect import EffectType, catalogue, effect_source, load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.objects import named_object
 from hannes_sim.rollout import rollout
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from .hand import make_controller
 from .hide import CONDITIONS
+from .lookalikes import LookAlikes, look_alikes
 
 Array = NDArray[np.float64]
 
@@ -34,6 +35,9 @@ CLOSURES_WITH_MEMORY = 20
 
 WORTH = {"motor_current": 0.05, "encoder_position": 0.05}
 """A change of this size (A, rad) counts as one, to choose the condition."""
+
+CONFUSED = 0.8
+"""Cosine from which another effect is listed as alike."""
 
 POINTS = 300
 """Points of a drawn curve."""
@@ -163,13 +167,29 @@ def _condition(found: Signature) -> str:
     return text + (f"; closure {found.closures} of a row" if found.closures > 1 else "")
 
 
-def section(found: Signature, picture: str) -> str:
+def confusion(known: LookAlikes) -> list[str]:
+    """Sentences on what an effect is confused with."""
+    alike = sorted(
+        ((c, name) for name, c in known.effects.items() if c >= CONFUSED),
+        key=lambda item: (-round(item[0], 2), item[1]),
+    )
+    others = ", ".join(f"`{name}` ({c:.2f})" for c, name in alike) or "no other effect of the catalogue"
+    part = "more than 99" if known.taken_over > 0.99 else f"{100.0 * known.taken_over:.0f}"
+    return [
+        f"Confused with: {others}.  ",
+        f"The hand's own parameters take over {part} % of it, `{known.parameter.partition('@')[0]}` above all.",
+        "",
+    ]
+
+
+def section(found: Signature, picture: str, known: LookAlikes) -> str:
     """One effect in Markdown."""
     effect = found.effect
     doc = inspect.cleandoc(effect.__doc__ or "")
     out = [f"## {effect.title}", "", f"`{effect.name}`", ""]
     out += [textwrap.fill(" ".join(part.split()), 118) + "\n" for part in _paragraphs(doc)]
-    out += [f"Looks like: {effect.looks_like}.  ", f"Best shown by: {effect.told_by}.", ""]
+    out += [f"Looks like: {effect.looks_like}.  ", f"Best shown by: {effect.told_by}.  "]
+    out += confusion(known)
     out += ["| parameter | unit | range | typical | off | |", "|---|---|---|---|---|---|"]
     for p in effect.parameters:
         off = "shape" if p.vanishing is None else f"{p.vanishing:g}"
@@ -207,6 +227,11 @@ Each picture shows one closure of the nominal model (grey) and of the same model
 (orange), in closed loop with the same reference, and below what changed. Shown is that of the conditions slow, fast and
 grasp in which most changes; the scales differ from picture to picture.
 
+"Confused with" lists the effects that imitate it in slow, fast and grasp closures with a 30 Hz rectified current: the
+cosine between what it does to the data and the best that the other can do, both after the hand's own parameters have
+taken over what they can (`hannes_lab/lookalikes.py`). At 1.00 such data cannot tell them apart; below 0.80 none is
+listed. The experiment named before it, or better loggers, can.
+
 Written by `hannes model effects --page docs/effects.md`.
 
 | effect | looks like |
@@ -219,13 +244,14 @@ def write_page(page: str | Path, names: Sequence[str], *, progress: Any = None) 
     page = Path(page)
     folder = page.parent / "figures" / "effects"
     rows, sections = [], []
+    alike = look_alikes([*catalogue(), *(n for n in names if n not in catalogue())])
     for k, name in enumerate(names):
         found = signature(name)
         effect = found.effect
         draw(found, folder / f"{effect.name}.svg")
         anchor = "".join(c for c in effect.title.lower().replace(" ", "-") if c.isalnum() or c in "-_")
         rows.append(f"| [{effect.title}](#{anchor}) `{effect.name}` | {effect.looks_like} |")
-        sections.append(section(found, f"figures/effects/{effect.name}.svg"))
+        sections.append(section(found, f"figures/effects/{effect.name}.svg", alike[effect.name]))
         if progress:
             progress(k + 1, len(names), effect.name)
     try:
