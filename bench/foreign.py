@@ -1,0 +1,270 @@
+"""The lab on recordings of another simulator: `python bench/foreign.py [--jobs N]`.
+
+Hands of `bench/other_hand.py`, perturbed and scattering from closure to closure, are recorded into plain rosbag2 bags
+without metadata: nothing says how they were logged, what was grasped, or which gains the controller has.  Each set is
+diagnosed with the nominal model.  Every result is kept in a file named by its content and the sources' hash, so
+that an interrupted run goes on where it stopped.  `--tuning` takes other seeds and strengths, for setting thresholds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import math
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hannes_description.model import Model
+from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.prepare import load_trials, prepare
+from joblib import Parallel, delayed
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+sys.path.insert(0, str(Path(__file__).parent))
+from identification import source_hash
+from other_hand import TICK, Hand, closures
+
+SPREAD = {
+    "resistance": 0.025, "kt": 0.015, "friction": 0.05, "viscous": 0.05, "preload": 0.025, "spring": 0.025,
+    "load_friction": 0.05,
+}  # fmt: skip
+"""Relative standard deviations from hand to hand."""
+
+SCATTER = {"friction": 0.02, "load_friction": 0.02, "viscous": 0.02, "resistance": 0.005, "preload": 0.005}
+"""The same from closure to closure; besides 0.002 rad of the encoder's zero, and of an object 2 % and 0.03 rad."""
+
+OBJECTS = {"rigid": (1.5, 8.1, 0.0), "soft": (0.0136, 5.6, 0.05)}
+"""Stiffness (N.m/rad at the pulley), angle of the contact, damping."""
+
+LOGS = {
+    "30 Hz rectified": (30.0, 1.0 / 30.0, True, 250.0),
+    "50 Hz": (50.0, 0.02, False, 100.0),
+    "100 Hz": (100.0, 0.01, False, 100.0),
+}
+"""Rate (Hz), averaging window (s) and rectifier of the current, and rate of the reference's log (Hz)."""
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+FLOAT, JOINTS = STORE.types["std_msgs/msg/Float64"], STORE.types["sensor_msgs/msg/JointState"]
+HEADER, TIME = STORE.types["std_msgs/msg/Header"], STORE.types["builtin_interfaces/msg/Time"]
+
+HIDDEN: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...]], ...] = (
+    (("viscous_friction",), "50 Hz", (("viscous", 3.5),)),
+    (("viscous_friction",), "30 Hz rectified", (("viscous", 5.0),)),
+    (("load_dependent_friction",), "100 Hz", (("capstan", 0.12),)),
+    (("load_dependent_friction",), "30 Hz rectified", (("capstan", 0.25),)),
+    (("glove_stiffness",), "50 Hz", (("glove", 4e-4), ("glove_power", 2.0))),
+    (("glove_stiffness",), "30 Hz rectified", (("glove", 3e-5),)),
+    (("wire_slack",), "100 Hz", (("slack", 0.6),)),
+    (("wire_slack",), "50 Hz", (("slack", 1.2),)),
+    (("stribeck_friction",), "100 Hz", (("stiction", 0.02), ("stiction_speed", 0.8))),
+    (("stribeck_friction",), "50 Hz", (("stiction", 0.04), ("stiction_speed", 0.4))),
+    (("direction_dependent_friction",), "100 Hz", (("asymmetry", 0.012),)),
+    (("direction_dependent_friction",), "50 Hz", (("asymmetry", 0.025),)),
+    (("cogging",), "100 Hz", (("ripple", 0.015), ("waves", 1.5))),
+    (("cogging",), "50 Hz", (("ripple", 0.025), ("waves", 0.8))),
+    (("current_sensor",), "100 Hz", (("current_gain", 1.15),)),
+    (("current_sensor",), "50 Hz", (("current_gain", 0.85),)),
+    (("glove_stiffness", "load_dependent_friction"), "100 Hz", (("glove", 3e-5), ("capstan", 0.2))),
+    (("viscous_friction", "wire_slack"), "50 Hz", (("viscous", 4.0), ("slack", 0.8))),
+    (("a worn spot",), "100 Hz", (("spot", 0.04),)),
+    (("a worn spot",), "30 Hz rectified", (("spot", 0.03), ("spot_at", 5.0))),
+    (("quadratic drag",), "100 Hz", (("drag", 1.5e-4),)),
+    (("quadratic drag",), "50 Hz", (("drag", 4e-4),)),
+)
+"""What is hidden, as the catalogue calls it if it does, the log, and values of Hand (`viscous` as a factor)."""
+
+OUTSIDE = ("a worn spot", "quadratic drag")
+RELATIVE = ("viscous",)
+
+CLEAN: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = (
+    ("30 Hz rectified", ()), ("50 Hz", ()), ("100 Hz", ()), ("30 Hz rectified", (("wire", 1.5),)),
+    ("50 Hz", (("kp", 0.55), ("kd", 0.03), ("current_kp", 0.05), ("current_ki", 600.0))),
+    ("100 Hz", (("friction", 0.020), ("load_friction", 0.012))), ("30 Hz rectified", (("blur", 0.1),)),
+    ("100 Hz", (("load", 8e-6), ("wire_damping", 2e-3))),
+)  # fmt: skip
+"""Nothing is hidden, but the hand, its controller or the simulator's friction law is another."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One set of recordings: slow and fast closures on nothing, slow ones on an object."""
+
+    hidden: tuple[str, ...]
+    log: str
+    changes: tuple[tuple[str, float], ...]
+    seed: int
+    grasp: str = "rigid"
+    repeats: int = 13
+
+    @property
+    def key(self) -> str:
+        here = Path(__file__).parent
+        sources = [source_hash(), *((here / f).read_text() for f in ("foreign.py", "other_hand.py"))]
+        return hashlib.sha256(json.dumps([asdict(self), sources]).encode()).hexdigest()[:20]
+
+
+def cases(tuning: bool) -> list[Case]:
+    """All sets; the tuning ones have other seeds and strengths."""
+    first = 100 if tuning else 700
+    out = [
+        Case((), log, values, first + k, "soft" if k % 4 == 2 else "rigid")
+        for k, (log, values) in enumerate(CLEAN)
+    ]
+    for k, (hidden, log, values) in enumerate(HIDDEN):
+        factor = 1.2 if tuning else 1.0
+        values = tuple((n, v if n in ("waves", "glove_power", "spot_at") else v * factor) for n, v in values)
+        out.append(Case(hidden, log, values, first + 50 + k))
+    return out
+
+
+def record(case: Case, folder: Path) -> None:
+    """The set as bags."""
+    rng = np.random.default_rng(case.seed)
+    base = Hand()
+    base = base._replace(
+        **{n: getattr(base, n) * math.exp(sd * rng.standard_normal()) for n, sd in SPREAD.items()}
+    )
+    base = base._replace(**{n: v * getattr(base, n) if n in RELATIVE else v for n, v in case.changes})
+    for name, period, grasp in (("slow", 4.0, ""), ("fast", 2.0, ""), ("grasp", 4.0, case.grasp)):
+        t = np.arange(round(period / TICK)) * TICK
+        reference = np.maximum(0.0, 13.0 * np.sin(2.0 * np.pi * t / period))
+        hand = base
+        if grasp:
+            k, at, damping = OBJECTS[grasp]
+            hand = base._replace(object_stiffness=k, object_at=at, object_damping=damping)
+        hands = []
+        for _ in range(case.repeats):
+            moved = {n: getattr(hand, n) * math.exp(sd * rng.standard_normal()) for n, sd in SCATTER.items()}
+            moved["zero"] = 0.002 * rng.standard_normal()
+            if grasp:
+                moved["object_stiffness"] = hand.object_stiffness * math.exp(0.02 * rng.standard_normal())
+                moved["object_at"] = hand.object_at + 0.03 * rng.standard_normal()
+            hands.append(hand._replace(**moved))
+        signals = closures(hands, reference)
+        _write(
+            folder / name,
+            np.concatenate([np.zeros(700), *([reference] * case.repeats)]),
+            signals,
+            case.log,
+            rng,
+        )
+
+
+def _write(
+    folder: Path, reference: np.ndarray, signals: np.ndarray, log: str, rng: np.random.Generator
+) -> None:
+    rate, window, rectified, reference_rate = LOGS[log]
+    width = round(window / TICK)
+    current = np.abs(signals[:, 1]) if rectified else signals[:, 1]
+    total = np.concatenate([np.zeros(width), np.cumsum(current)])
+    current = (total[width:] - total[:-width]) / width
+    at = np.arange(int(reference.size * TICK * rate)) / rate + 3e-4
+    tick = np.minimum((at / TICK).astype(int), reference.size - 1)
+    amperes = current[tick] + 0.005 * rng.standard_normal(tick.size)
+    amperes = np.abs(amperes) if rectified else amperes
+    stamps = at + np.abs(rng.normal(0.0, 1e-3, at.size))
+    told = np.arange(int(reference.size * TICK * reference_rate)) / reference_rate
+    values = reference[(told / TICK + 1e-6).astype(int)]
+    events = [(float(a), 0, float(v)) for a, v in zip(told, values, strict=True)]
+    events += [(float(a), 1, float(v)) for a, v in zip(stamps, signals[tick, 0], strict=True)]
+    events += [(float(a), 2, float(v)) for a, v in zip(stamps, amperes, strict=True)]
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = (("reference_position", FLOAT), ("motor/state", JOINTS), ("motor/current", FLOAT))
+        to = [writer.add_connection(f"/hannes/{t}", kind.__msgtype__, typestore=STORE) for t, kind in topics]
+        none = np.zeros(0)
+        for a, which, value in sorted(events):
+            stamp = int((1.7e9 + a) * 1e9)
+            message: Any = FLOAT(value)
+            if which == 1:
+                header = HEADER(TIME(stamp // 10**9, stamp % 10**9), "")
+                message = JOINTS(header, ["motor_pulley"], np.array([value]), none, none)
+            writer.write(to[which], stamp + 1_000_000, STORE.serialize_cdr(message, message.__msgtype__))
+
+
+def run_case(case: Case) -> dict[str, Any]:
+    """Record, diagnose with the nominal model, compare with the truth."""
+    with tempfile.TemporaryDirectory() as folder:
+        record(case, Path(folder))
+        start = time.monotonic()
+        model = Model.load()
+        prepared = prepare(load_trials([Path(folder)]), model)
+        found = diagnose(prepared, effect_sources(model=model))
+    return {
+        "hidden": sorted(case.hidden),
+        "log": case.log,
+        "changes": dict(case.changes),
+        "seed": case.seed,
+        "verdict": found.verdict,
+        "named": sorted(e.name for e in found.effects) if found.verdict == "effects" else [],
+        "tied": [sorted(t) for t in found.tied],
+        "falls": [[f.added, f.held_out, dict(f.by_condition)] for f in found.falls],
+        "costs": dict(found.costs),
+        "seconds": time.monotonic() - start,
+    }
+
+
+def as_hidden(result: dict[str, Any]) -> bool:
+    """Nothing, unknown, or the hidden effects themselves, alone or in a tie."""
+    if not result["hidden"]:
+        return bool(result["verdict"] == "nothing")
+    if result["hidden"][0] in OUTSIDE:
+        return bool(result["verdict"] == "unknown")
+    return result["hidden"] in (result["tied"] or [result["named"]])
+
+
+def _kept(case: Case, file: Path) -> dict[str, Any]:
+    if not file.exists():
+        temporary = file.with_suffix(".tmp")
+        temporary.write_text(json.dumps(run_case(case)))
+        temporary.replace(file)
+    result: dict[str, Any] = json.loads(file.read_text())
+    return result
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--tuning", action="store_true", help="other seeds and strengths")
+    parser.add_argument("--out", type=Path, default=Path("out/foreign"), help="folder of the kept results")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    todo = cases(options.tuning)
+    runs = Parallel(n_jobs=options.jobs, return_as="generator")(
+        delayed(_kept)(c, options.out / f"{c.key}.json") for c in todo
+    )
+    results = []
+    for k, r in enumerate(runs):
+        results.append(r)
+        what = " + ".join(r["hidden"]) or "nothing"
+        said = " + ".join(r["named"]) or r["verdict"]
+        ties = "".join(f", tied with {' + '.join(t)}" for t in r["tied"] if t != r["named"])
+        errors = " -> ".join(f"{f[1]:.1f}" for f in r["falls"][1:])
+        mark = "ok " if as_hidden(r) else "NOT"
+        print(
+            f"[{k + 1}/{len(todo)}] {mark} {what}, {r['log']}: {said}{ties}; held out {errors} ({r['seconds']:.0f} s)",
+            flush=True,
+        )
+    for label, part in (
+        ("nothing hidden: answered nothing", [r for r in results if not r["hidden"]]),
+        (
+            "one hidden: named, or in a tie",
+            [r for r in results if len(r["hidden"]) == 1 and r["hidden"][0] not in OUTSIDE],
+        ),
+        ("two hidden: both", [r for r in results if len(r["hidden"]) == 2]),
+        ("in no catalogue: unknown", [r for r in results if r["hidden"] and r["hidden"][0] in OUTSIDE]),
+    ):
+        print(f"{label:<40} {sum(map(as_hidden, part))} of {len(part)}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
