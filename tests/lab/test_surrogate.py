@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hannes_description.model import Model
+from hannes_lab.chance import chance
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.features import compact_end
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.problem import nuisance_coordinate
+from hannes_lab.search import Search
 from hannes_lab.surrogate import AnchoredRig, repeated, rig_for
 from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import strength_of
@@ -65,6 +67,19 @@ def test_what_is_unknown_of_a_recording_of_others_can_be_moved_on_every_plant(tr
         moved = {nuisance.name: nuisance_coordinate(nuisance).value(0.5)}
         run = rig.simulate(model, moved, strange, strange.reference[:300])
         assert all(np.isfinite(signal).all() for signal in run.values()), nuisance.name
+
+
+def test_the_full_hand_fits_its_own_recordings_also_without_a_description():
+    recordings, _ = make_set(FULL, [], seed=31, closures=6, conditions=("fast", "grasp"))
+    trials = [make_trial(r) for r in recordings]
+    strange = [replace(t, options={k: v for k, v in t.options.items() if k != "sensors"}) for t in trials]
+    prepared = prepare(strange, FULL, surrogate=True)
+    search = Search(prepared.problem, FULL, prepared.nuisances, effect_sources(only=["cogging"]))
+    null = search.null().fit
+    limits = chance(search.problem, null, {})
+    assert null.cost < limits.misfit
+    far = {c.name: z for c, z in zip(null.coordinates, null.z, strict=True) if abs(z) > 3.0}
+    assert not any(name.startswith(("hand.", "friction.", "motor.")) for name in far), far
 
 
 def test_later_closures_repeat_the_second(trial):

@@ -129,7 +129,7 @@ def prepare(
     view = rig_for(rig, model, coordinates) if surrogate else rig
     problem = build_problem(view, features, model, nuisances, {})
     found = fit(problem, model, coordinates, {}, evaluations=15)
-    settled, found = settle(problem, found, renew=False)
+    settled, found = settle(problem, found)
     problem = build_problem(settled.rig, features, model, nuisances, found.values, problem.counts)
     notes = [f"{trial.name}: {note}" for trial in trials for note in trial.notes]
     if len(features.conditions) < 2:

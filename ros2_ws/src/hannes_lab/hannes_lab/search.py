@@ -123,7 +123,7 @@ class Search:
 
     def _null(self) -> Candidate:
         found = fit(self.problem, self.model, self.coordinates, {}, rows=self.rows, evaluations=25)
-        best = settle(self.problem, found, self.rows, renew=False)[1]
+        best = settle(self.problem, found, self.rows)[1]
         return Candidate((), best, best.cost)
 
     def with_effects(self, names: Names) -> tuple[Model, tuple[Coordinate, ...]]:

@@ -31,6 +31,9 @@ FAST_PLANT = "reduced"
 SLOW_PLANTS = ("mujoco",)
 """Plants of which a whole diagnosis would take longer than a coffee."""
 
+KNOWN_WELL = Nuisance.step
+"""Step of finite differences, in standard deviations, of a parameter whose prior is narrow; smaller is a wide one."""
+
 KEPT = 64
 """Corrections that are kept: one per anchor, trial and length."""
 
@@ -179,10 +182,11 @@ def repeated(known: Array, trial: Trial, size: int) -> Array:
 def rig_for(rig: Rig, model: Model, coordinates: Sequence[Coordinate]) -> Rig:
     """The rig to search with: the rig itself, or anchored at the nominal values where the model's plant is slow.
 
-    The slow plant's slopes along the coordinates are taken there: near to them is where the truth is expected.
+    The slow plant's slopes are taken there along the coordinates that are known well: near to their nominal values is
+    where the truth is expected.  Across a wide prior a slope at its middle would lead astray.
     """
     if model.plant in SLOW_PLANTS and isinstance(rig, PlantRig):
-        return AnchoredRig(rig, model, {}).sloped(coordinates)
+        return AnchoredRig(rig, model, {}).sloped([c for c in coordinates if c.step >= KNOWN_WELL])
     return rig
 
 
