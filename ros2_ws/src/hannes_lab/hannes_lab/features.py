@@ -122,7 +122,8 @@ class Features:
         for trial, end in zip(self.trials, self.ends, strict=True):
             compact = end is not None and not memory
             reference = trial.reference[:end] if compact else trial.reference
-            runs.append((rig.simulate(model, values, trial, reference), compact))
+            signals = rig.simulate(model, values, trial, reference)
+            runs.append((signals, compact and all(s.size == reference.size for s in signals.values())))
         return [
             block.predicted(runs[block.trial][0][block.signal], runs[block.trial][1]) for block in self.blocks
         ]

@@ -23,6 +23,7 @@ from hannes_description.parameters import read_yaml
 from hannes_sim.effect import EffectType, load_class
 from hannes_sim.factory import make_plant
 from hannes_sim.plant import Plant
+from hannes_sim.ports import R_Q, R_QL
 from hannes_sim.rollout import Controller, Rollout, rollout
 from numpy.typing import NDArray
 
@@ -80,6 +81,10 @@ class Nuisance:
         return self.mean * math.exp(self.sd * z) if self.log else self.mean + self.sd * z
 
 
+COMES_BACK = 1e-4
+"""Part of the reference's span within which a closure ends where the one before it did."""
+
+
 class Rig(Protocol):
     """A machine: plant and controller behind one call.
 
@@ -123,8 +128,9 @@ class Rig(Protocol):
     ) -> Mapping[str, Array]:
         """Logged signals on the control grid for a reference (n,): what each logger would show at tick k.
 
-        `values` overrides parameters of the model by name (nominal ones, and effect.parameter).
-        Raises PlantDiverged.
+        `values` overrides parameters of the model by name (nominal ones, and effect.parameter).  A reference that is
+        cut after the second closure says that the later ones repeat it.  Where they would not, since the machine does
+        not come back to where it was, the signals of the whole trial are given.  Raises PlantDiverged.
         """
 
 
@@ -164,6 +170,7 @@ class PlantRig:
         self.trials = tuple(trials)
         self._plants: dict[tuple[str, ...], tuple[Plant, Controller, dict[str, float]]] = {}
         self._signals: OrderedDict[tuple[Any, ...], dict[str, Array]] = OrderedDict()
+        self._came_back = True
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A class from a user's file cannot be imported by name in another process.
@@ -236,7 +243,10 @@ class PlantRig:
         if key in self._signals:
             self._signals.move_to_end(key)
         else:
-            self._signals[key] = self.observed(model, values, trial, reference)
+            signals = self.observed(model, values, trial, reference)
+            if not self._came_back and reference.size < trial.reference.size:
+                signals = self.observed(model, values, trial, trial.reference)
+            self._signals[key] = signals
             if len(self._signals) > REMEMBERED:
                 self._signals.popitem(last=False)
         return self._signals[key]
@@ -257,7 +267,9 @@ class PlantRig:
             if name not in base:
                 base[name] = plant.get(name)
             plant.set(name, value)
-        return rollout(plant, controller, reference, joints=False)
+        done = rollout(plant, controller, reference, joints=False)
+        self._came_back = _came_back(done, trial)
+        return done
 
     def _key(self, model: Model, trial: Trial) -> tuple[str, ...]:
         """What tells one plant from another, but for the values of its parameters."""
@@ -270,6 +282,18 @@ class PlantRig:
         if key not in self._plants:
             self._plants[key] = (self.plant(model, trial), self.controller(model, trial.period), {})
         return self._plants[key]
+
+
+def _came_back(run: Rollout, trial: Trial) -> bool:
+    """Whether the second closure ends where the first did, on both sides of the wire: then all repeat it.
+
+    A hand whose joints stick stays where they stop, a little further with each closure, which the encoder hardly shows.
+    """
+    ends = [round(closure.stop / trial.period) for closure in trial.closures[:2]]
+    if len(ends) < 2 or ends[1] >= run.raw.shape[0]:
+        return True
+    here, there = run.raw[ends[0], [R_Q, R_QL]], run.raw[ends[1], [R_Q, R_QL]]
+    return bool(np.abs(here - there).max() <= COMES_BACK * np.ptp(trial.reference))
 
 
 def _wanted(model: Model, values: Mapping[str, float], trial: Trial) -> dict[str, float]:

@@ -101,12 +101,14 @@ class AnchoredRig:
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
     ) -> dict[str, Array]:
         """See Rig; only the signals that were recorded."""
-        total = self._correction(trial, reference) + self._fast(model, values, trial, reference)
+        fast = self._fast(model, values, trial, reference)
+        size = fast.shape[1]
+        total = fast + self._correction(trial, reference, size)
         for name, slope in self._slopes.items():
             if name in values and trial.name in slope.signals:
                 away = slope.away(values[name], self._values)
                 if away != 0.0:
-                    total += away * slope.on(trial, reference.size)
+                    total += away * slope.on(trial, size)
         return dict(zip(trial.signals, total, strict=True))
 
     def _fast(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Array:
@@ -118,12 +120,13 @@ class AnchoredRig:
         return np.array([run[name] for name in trial.signals])
 
     def _difference(self, values: Mapping[str, float], trial: Trial, reference: Array) -> Array:
-        """Slow - fast (signals, ticks)."""
+        """Slow - fast (signals, ticks); the whole trial only where both plants gave it."""
         slow = self._slow(self._model, values, trial, reference)
-        return slow - self._fast(self._model, values, trial, reference)
+        fast = self._fast(self._model, values, trial, reference)
+        ticks = min(slow.shape[1], fast.shape[1])
+        return slow[:, :ticks] - fast[:, :ticks]
 
-    def _correction(self, trial: Trial, reference: Array) -> Array:
-        size = reference.size
+    def _correction(self, trial: Trial, reference: Array, size: int) -> Array:
         if not has_memory(self._model):
             reference = reference[: compact_end(trial)]
         key = (self._anchor, trial.name, reference.size)
@@ -142,7 +145,8 @@ class AnchoredRig:
         for trial in self.trials:
             if where in ("", trial.name):
                 reference = trial.reference[: compact_end(trial)]
-                change = self._difference(moved, trial, reference) - self._correction(trial, reference)
+                change = self._difference(moved, trial, reference)
+                change = change[:, : reference.size] - self._correction(trial, reference, reference.size)
                 signals[trial.name] = change / step
         return _Slope(c, signals)
 
