@@ -15,6 +15,7 @@ Whitened residual: L_c^{-1} (measured - predicted), C_c = L_c L_c^T.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -60,7 +61,8 @@ class Coordinate:
     unit: str = ""
 
     def value(self, z: float) -> float:
-        raw = self.offset * float(np.exp(self.scale * z)) if self.log else self.offset + self.scale * z
+        # A step of the search may go to where no number is; the bounds bring it back.
+        raw = self.offset * math.exp(min(self.scale * z, 700.0)) if self.log else self.offset + self.scale * z
         return min(max(raw, self.lower), self.upper)
 
     def z(self, value: float) -> float:
