@@ -39,7 +39,7 @@ LIMIT = 512 * 2**20
 STALE = 3600.0
 """Seconds after which an unfinished file belongs to a process that is gone."""
 
-NO_RESULT = ("cli", "report", "pictures", "effects_page", "compare", "hide", "calibrate")
+NO_RESULT = ("cli", "report", "pictures", "effects_page", "page", "compare", "hide", "calibrate")
 """Beginnings of the names of the lab's files on which no result of a search depends."""
 
 NOT_CONTENT: Mapping[str, frozenset[str]] = {

@@ -52,6 +52,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("validate", "hannes_lab.validation.cli:validate", "Hold the model against the thesis, row by row."),
     Command("hide", "hannes_lab.cli:hide", "Make a measurement set with a hidden effect."),
     Command("report", "hannes_lab.cli:report", "Compare, diagnose and add, on one HTML page."),
+    Command("page", "hannes_lab.page:page", "Compare, diagnose and add, in a web page of this machine."),
     Command("model", "hannes_bringup.cli.model:app", "Show models: parameters with provenance, effects."),
     Command("stiffness", "hannes_stiffness.cli:app", "Train and test the classifier of the grasped object."),
 )
