@@ -1,37 +1,33 @@
 """The lab's web page: the answers of compare, diagnose and add, and how far the work is, in a browser.
 
-The page computes nothing: a worker process (page_worker.py) does what the commands do, and what it found is shown as the
-report of the command line.  The page is served to this machine alone and to nobody without the link on the terminal.
+The page computes nothing: a worker process (page_worker.py) does what the commands do, and what it found is shown as
+the report of the command line.  Who may see it: page_guard.py.
 """
 
 from __future__ import annotations
 
 import asyncio
-import hmac
 import html
-import ipaddress
 import json
 import os
-import secrets
 import signal
 import socket
 import sys
 import tempfile
 import time
 import webbrowser
-from collections.abc import Awaitable, Callable, Mapping, MutableMapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from typing import Annotated, Any
-from urllib.parse import parse_qs
 
 import typer
 from hannes_description.errors import HannesError
 
 from .cli import _JOBS, Bags, Greedy, Jobs, MaxEffects, ModelFile, Objects, RigFile, Scale, Signals
 from .diagnose import MAX_EFFECTS
+from .page_guard import Guard, address_of
 from .page_worker import ANSWER, GRACE_S, MODEL, REPORT
 
 HERE = Path(__file__).parent
@@ -74,7 +70,6 @@ class Work:
     data: Mapping[str, Any] | None = None
     answer: Mapping[str, Any] | None = None
     answers: int = 0
-    _process: asyncio.subprocess.Process | None = None
     _task: asyncio.Task[None] | None = None
     _cancelled: bool = False
 
@@ -97,8 +92,6 @@ class Work:
     async def cancel(self) -> None:
         """End the task; what it has found so far is kept in the store."""
         self._cancelled = True
-        if self._process is not None and self._process.stdin is not None:
-            self._process.stdin.close()  # which the worker takes for Ctrl-C
         await self.wait()
 
     async def _run(self, task: Mapping[str, Any]) -> None:
@@ -112,24 +105,19 @@ class Work:
         except OSError as error:
             self.problem = f"The worker process cannot be started: {error}."
             return
-        self._process = process
-        if self._cancelled and process.stdin is not None:
-            process.stdin.close()
+        assert process.stdin is not None and process.stdout is not None
         try:
-            assert process.stdout is not None
             reading = asyncio.create_task(self._listen(process.stdout, folder))
-            while not reading.done():
-                # the worker ends itself GRACE_S after it is told to, unless it is stuck
-                await asyncio.wait([reading], timeout=2.0 * GRACE_S if self._cancelled else 0.5)
-                if self._cancelled and not reading.done():
-                    break
-            self._end_all(process)
-            code = await process.wait()
-            await reading
+            while not reading.done() and not self._cancelled:
+                await asyncio.wait([reading], timeout=0.2)
+            process.stdin.close()  # which the worker takes for Ctrl-C
+            await asyncio.wait([reading], timeout=2.0 * GRACE_S)
         finally:
             self._end_all(process)
-            self._process, self.ended = None, time.monotonic()
-        if self._cancelled:
+            self.ended = time.monotonic()
+        code = await process.wait()
+        await reading
+        if code and self._cancelled:
             self.problem = "Cancelled. What was found is kept: the same button goes on from there."
         elif code and not self.problem:
             how = f"was ended by signal {-code}, perhaps for want of memory" if code < 0 else "failed"
@@ -142,7 +130,9 @@ class Work:
             os.killpg(process.pid, signal.SIGKILL)
 
     async def _listen(self, lines: asyncio.StreamReader, folder: Path) -> None:
-        while line := await lines.readline():
+        while (line := await lines.readline()).endswith(
+            b"\n"
+        ):  # a process that is ended may leave half a line
             message = json.loads(line)
             kind = message.pop("kind")
             if kind == "progress":
@@ -165,153 +155,6 @@ class Work:
             last.done, last.total = done, total
 
 
-# -- who may see the page -------------------------------------------------------------------------------------------
-Scope = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Any]]
-Send = Callable[[Any], Awaitable[None]]
-
-ENTRY = b'<!doctype html><meta http-equiv="refresh" content="0;url=/"><title>Hannes</title><p><a href="/">Go on</a>'
-"""Not a redirection: a link that was followed from another site would be refused the cookie."""
-
-REFUSAL = b"Refused. Open the page by the link on the terminal where `hannes page` runs; a link works once.\n"
-
-
-class Guard:
-    """Lets in who holds the cookie, which the link of the terminal is exchanged for; everybody else gets 403.
-
-    Host must name this machine, so that no foreign name can be pointed at it (DNS rebinding); Origin must be the page's
-    own, so that no foreign page can act through the user's browser.
-    """
-
-    def __init__(self, app: Any, *, port: int, names: Sequence[str] = (), any_address: bool = False,
-                 used: Callable[[], None] | None = None) -> None:  # fmt: skip
-        """Guard an ASGI application.
-
-        names        names and addresses beside those of the loopback by which it may be called
-        any_address  any numeric address is right: a foreign name is none
-        used         is called when a link was used; the next one is `link_token`
-        """
-        self.app = app
-        self.cookie = f"hannes_page_{port}"  # cookies of one host are shared by its ports
-        self.link_token = secrets.token_urlsafe(32)
-        self._sessions: set[str] = set()
-        self._names = {"localhost", "127.0.0.1", "::1", *(n.lower() for n in names)}
-        self._any_address = any_address
-        self._used = used
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "lifespan":
-            await self.app(scope, receive, send)
-            return
-        headers: dict[str, list[str]] = {}
-        for name, value in scope["headers"]:
-            headers.setdefault(name.decode("latin-1").lower(), []).append(value.decode("latin-1"))
-        if not self._at_home(scope, headers):
-            await _refuse(scope, send)
-        elif self._known(headers):
-            await self._pass(scope, receive, _with_headers(send, headers["host"][0]))
-        elif self._enters(scope):
-            session = secrets.token_urlsafe(32)
-            self._sessions.add(session)
-            self.link_token = secrets.token_urlsafe(32)
-            cookie = f"{self.cookie}={session}; Path=/; HttpOnly; SameSite=Strict"
-            await _answer(send, 200, ENTRY, b"text/html; charset=utf-8", [(b"set-cookie", cookie.encode())])
-            if self._used:
-                self._used()
-        else:
-            await _refuse(scope, send)
-
-    async def _pass(self, scope: Scope, receive: Receive, send: Send) -> None:
-        gone = False
-
-        async def noted() -> Any:
-            nonlocal gone
-            message = await receive()
-            gone = gone or message["type"] == "http.disconnect"
-            return message
-
-        try:
-            await self.app(scope, noted, send)
-        except RuntimeError:
-            if not gone:  # a browser that closed the page before it was answered is no error
-                raise
-
-    def _at_home(self, scope: Scope, headers: Mapping[str, list[str]]) -> bool:
-        host, origin = headers.get("host", []), headers.get("origin", [])
-        if len(host) != 1 or len(origin) > 1 or not self._named(host[0]):
-            return False
-        if not origin:  # browsers send none with what only reads
-            return scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
-        return origin[0].lower() in (f"http://{host[0].lower()}", f"https://{host[0].lower()}")
-
-    def _named(self, host: str) -> bool:
-        name, colon, port = host.lower().rpartition(":")
-        if not colon or not port.isdecimal():
-            name = host.lower()
-        name = name.removeprefix("[").removesuffix("]")
-        return name in self._names or (self._any_address and _address(name) is not None)
-
-    def _known(self, headers: Mapping[str, list[str]]) -> bool:
-        try:
-            cookie = SimpleCookie("; ".join(headers.get("cookie", []))).get(self.cookie)
-        except CookieError:
-            return False
-        given = cookie.value.encode() if cookie else b""
-        return any(hmac.compare_digest(given, session.encode()) for session in self._sessions)
-
-    def _enters(self, scope: Scope) -> bool:
-        if scope["type"] != "http" or scope["method"] != "GET" or scope["path"] != "/":
-            return False
-        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        return hmac.compare_digest(given.encode(), self.link_token.encode())
-
-
-def _with_headers(send: Send, host: str) -> Send:
-    """Answers that the browser may use for this page only, and which may load nothing from elsewhere."""
-    policy = (
-        "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
-        f"img-src 'self' data:; font-src 'self' data:; connect-src 'self' ws://{host} wss://{host}; "
-        "object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
-    )
-
-    async def add(message: Any) -> None:
-        if message["type"] == "http.response.start":
-            message["headers"] = [*message.get("headers", []), *PRIVATE,
-                                  (b"content-security-policy", policy.encode("latin-1"))]  # fmt: skip
-        await send(message)
-
-    return add
-
-
-PRIVATE = [
-    (b"x-content-type-options", b"nosniff"),
-    (b"referrer-policy", b"no-referrer"),
-    (b"cross-origin-resource-policy", b"same-origin"),
-    (b"cross-origin-opener-policy", b"same-origin"),
-]
-
-
-async def _answer(send: Send, status: int, body: bytes, kind: bytes, more: Sequence[tuple[bytes, bytes]] = ()) -> None:
-    length = str(len(body)).encode()
-    headers = [(b"content-type", kind), (b"content-length", length), (b"cache-control", b"no-store"), *PRIVATE, *more]
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": body})
-
-
-async def _refuse(scope: Scope, send: Send) -> None:
-    if scope["type"] == "websocket":
-        await send({"type": "websocket.close", "code": 1008})  # before it is accepted: the server answers 403
-    else:
-        await _answer(send, 403, REFUSAL, b"text/plain; charset=utf-8")
-
-
-def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    try:
-        return ipaddress.ip_address(name)
-    except ValueError:
-        return None
-
-
 # -- what it looks like ---------------------------------------------------------------------------------------------
 def make_app(work: Work) -> Any:
     """The ASGI application: NiceGUI's, and the files of the last answer."""
@@ -323,15 +166,17 @@ def make_app(work: Work) -> Any:
         answer = work.answer
         if answer is None or number != answer["number"] or name not in answer["files"]:
             raise HTTPException(404, "There is a newer answer; reload the page.")
-        kind = {"filename": name} if download else {}
-        return FileResponse(answer["folder"] / name, headers={"cache-control": "no-store"}, **kind)
+        headers = {"cache-control": "no-store"}
+        return FileResponse(answer["folder"] / name, headers=headers, filename=name if download else None)
 
     def show() -> None:
         _View(work)
 
     app = FastAPI(openapi_url=None)
     app.add_api_route("/answer/{number}/{name}", file)
-    ui.run_with(app, root=show, title="Hannes lab", favicon="🖐", dark=None, tailwind=False, show_welcome_message=False)
+    ui.run_with(
+        app, root=show, title="Hannes lab", favicon="🖐", dark=None, tailwind=False, show_welcome_message=False
+    )
     return app
 
 
@@ -343,8 +188,11 @@ class _View:
 
         self.work, self.ui = work, ui
         self._shown = 0
+        self._titles: dict[str, str] = {}
         style = (HERE / "static" / "report.css").read_text(encoding="utf-8")
-        ui.add_head_html(f"<style>{style}\n{(HERE / 'static' / 'page.css').read_text(encoding='utf-8')}</style>")
+        ui.add_head_html(
+            f"<style>{style}\n{(HERE / 'static' / 'page.css').read_text(encoding='utf-8')}</style>"
+        )
         ui.colors(primary="#1264a8")
         with ui.element("main"):
             ui.html("<h1>Model against measurement</h1>")
@@ -355,7 +203,10 @@ class _View:
                 self.cancel = ui.button("Cancel", on_click=work.cancel).props("outline")
             with ui.element("div").classes("actions"):
                 self.effects = ui.select(
-                    {}, label="Effects: choose, or type path.py:Class", multiple=True, new_value_mode="add-unique"
+                    {},
+                    label="Effects: choose, or type path.py:Class",
+                    multiple=True,
+                    new_value_mode="add-unique",
                 )
                 self.add = ui.button("Add to the model", on_click=self._add)
                 self.only = ui.checkbox("Diagnose with these only")
@@ -381,20 +232,24 @@ class _View:
         self.add.set_enabled(not work.running and bool(self.effects.value))
         self.only.set_enabled(not work.running and bool(self.effects.value))
         self.cancel.set_enabled(work.running)
-        new = {name: title for name, title in work.titles.items() if name not in self.effects.options}
-        if new:
-            self.effects.set_options({**new, **self.effects.options})
+        if not self._titles and work.titles:
+            self._offer(work.titles)
         self.data.content = data_html(work.data, work.settings["bags"])
         self.progress.content = progress_html(work)
         if work.answer and work.answer["number"] != self._shown:
             self._shown = work.answer["number"]
             self._show(work.answer)
 
+    def _offer(self, titles: Mapping[str, str]) -> None:
+        """Effects that can be chosen, beside those that are and those that were typed in."""
+        self._titles = {**titles, **{name: name for name in self.effects.value}, **self._titles}
+        self.effects.set_options(dict(self._titles))
+
     def _show(self, answer: Mapping[str, Any]) -> None:
         ui, place = self.ui, f"/answer/{answer['number']}"
         if answer["effects"]:
-            own = {source: source for source in answer["effects"] if source not in self.effects.options}
-            self.effects.set_options({**self.effects.options, **own}, value=answer["effects"])
+            self._offer({source: self._titles.get(source, source) for source in answer["effects"]})
+            self.effects.set_value(list(answer["effects"]))
         self.answer.clear()
         with self.answer:
             ui.html(verdict_html(answer["verdict"]))
@@ -412,19 +267,19 @@ def data_html(data: Mapping[str, Any] | None, bags: Sequence[Any]) -> str:
     """The bags with their conditions, closures and signals, and what was noticed in them."""
     if data is None:
         return f'<p class="lead">{html.escape(", ".join(map(str, bags)))}</p>'
-    cells = "".join(
+    rows = "".join(
         "<tr>"
         f"<th>{html.escape(d['name'])}<small>{html.escape(d['source'])}</small></th>"
         f"<td>{html.escape(', '.join(d['conditions']))}</td><td class='num'>{d['closures']}</td>"
         f"<td>{html.escape(', '.join(s.replace('_', ' ') for s in d['signals']))}</td></tr>"
         for d in data["data"]
     )
-    notes = "".join(f"<li>{html.escape(note)}</li>" for note in data["notes"])
-    return (
-        f"<p class='lead'>Model: {html.escape(data['model'])}</p><div class='scroll'><table><thead><tr><th>recording</th>"
-        f"<th>conditions</th><th class='num'>closures</th><th>signals</th></tr></thead><tbody>{cells}</tbody></table></div>"
-        + (f"<details><summary>{len(data['notes'])} notes</summary><ul class='notes'>{notes}</ul></details>" if notes else "")
-    )
+    head = "<th>recording</th><th>conditions</th><th class='num'>closures</th><th>signals</th>"
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+    items = "".join(f"<li>{html.escape(note)}</li>" for note in data["notes"])
+    notes = f"<details><summary>Notes: {len(data['notes'])}</summary><ul class='notes'>{items}</ul></details>"
+    model = f"<p class='lead'>Model: {html.escape(data['model'])}</p>"
+    return f"{model}<div class='scroll'>{table}</div>{notes if items else ''}"
 
 
 def progress_html(work: Work) -> str:
@@ -437,7 +292,8 @@ def progress_html(work: Work) -> str:
         return f"<p class='done'>{DOING[work.action]}: done in {_clock(work.ended - work.began)}.</p>"
     bars = "".join(
         f"<div class='round'><span>{html.escape(r.text)}</span>"
-        f"<progress max='{max(r.total, 1)}' value='{r.done}'></progress><span class='num'>{r.done}/{r.total}</span></div>"
+        f"<progress max='{max(r.total, 1)}' value='{r.done}'></progress>"
+        f"<span class='num'>{r.done}/{r.total}</span></div>"
         for r in work.rounds
     )
     return f"<p class='done'>{DOING[work.action]}: {_clock(time.monotonic() - work.began)}</p>{bars}"
@@ -445,9 +301,11 @@ def progress_html(work: Work) -> str:
 
 def verdict_html(verdict: Mapping[str, str]) -> str:
     """The verdict in the report's words."""
-    kind, label, headline, summary = (html.escape(verdict[k]) for k in ("kind", "label", "headline", "summary"))
-    lines = f"<p class='badge'>{label}</p><h2>{headline}</h2>" + (f"<p class='summary'>{summary}</p>" if summary else "")
-    return f"<div class='verdict {kind}'>{lines}</div>"
+    kind, label, headline, summary = (
+        html.escape(verdict[k]) for k in ("kind", "label", "headline", "summary")
+    )
+    more = f"<p class='summary'>{summary}</p>" if summary else ""
+    return f"<div class='verdict {kind}'><p class='badge'>{label}</p><h2>{headline}</h2>{more}</div>"
 
 
 def _clock(seconds: float) -> str:
@@ -472,8 +330,19 @@ def page(
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the link.")] = False,
 ) -> None:
     """Compare, diagnose and add in a web page of this machine."""
-    settings = {"bags": [str(b) for b in bags], "model": model, "rig": rig, "objects": objects, "scale": scale}
-    settings |= {"signals": signals, "max_effects": max_effects, "greedy": greedy, "jobs": jobs}
+    settings: dict[str, Any] = {
+        "bags": [str(b) for b in bags],
+        "model": model,
+        "rig": rig,
+        "objects": objects,
+    }
+    settings |= {
+        "scale": scale,
+        "signals": signals,
+        "max_effects": max_effects,
+        "greedy": greedy,
+        "jobs": jobs,
+    }
     with tempfile.TemporaryDirectory(prefix="hannes_page_") as folder, listen(host, port) as listener:
         os.environ["NICEGUI_STORAGE_PATH"] = folder  # else NiceGUI would look for its own folder in this one
         serve(Work(settings, Path(folder)), listener, host, browser=not no_browser)
@@ -487,12 +356,13 @@ def listen(host: str, port: int) -> socket.socket:
         try:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(place)
+            listener.listen()  # who follows the link at once waits until the page is there
         except OSError:
             listener.close()
             raise
     except OSError as error:
         raise HannesError(
-            f"The page cannot listen at {host}, port {port}: {error.strerror or error}. Choose another --port or --host."
+            f"The page cannot listen at {host}, port {port}: {error.strerror or error}. Give another --port or --host."
         ) from error
     return listener
 
@@ -507,7 +377,7 @@ def serve(work: Work, listener: socket.socket, host: str, *, browser: bool) -> N
             "The page needs the libraries of the extra 'page': pip install 'hannes_lab[page]'."
         ) from error
     address, port = listener.getsockname()[:2]
-    bound = _address(address)
+    bound = address_of(address)
     off_host = bound is not None and not bound.is_loopback
     names = [host, address, *([socket.gethostname(), socket.getfqdn()] if off_host else [])]
     called = socket.gethostname() if bound is not None and bound.is_unspecified else host
@@ -536,6 +406,11 @@ def serve(work: Work, listener: socket.socket, host: str, *, browser: bool) -> N
     nicegui_app.on_startup(started)
     nicegui_app.on_shutdown(work.cancel)
     config = uvicorn.Config(
-        guard, log_level="warning", ws="wsproto", timeout_graceful_shutdown=2, server_header=False, proxy_headers=False
+        guard,
+        log_level="warning",
+        ws="wsproto",
+        timeout_graceful_shutdown=2,
+        server_header=False,
+        proxy_headers=False,
     )
     uvicorn.Server(config).run(sockets=[listener])

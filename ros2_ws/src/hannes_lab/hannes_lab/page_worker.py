@@ -46,7 +46,8 @@ FIT = {"model": "model", "rig": "rig", "objects": "object", "scale": "scale", "s
 
 def main(folder: Path) -> int:
     """Carry out the task of a folder; exit codes are those of the `hannes` command."""
-    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    # not closed before the process ends, so that its end is the end of the lines
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8", closefd=False)
     os.dup2(2, 1)  # what a library prints belongs on the terminal, not between the lines of JSON
     # a shell that starts the page in its background makes all below it deaf to the signal that ends a task
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -99,7 +100,9 @@ def work(task: Mapping[str, Any], folder: Path, say: Say) -> None:
     progress = _Progress(say)
     say({"kind": "effects", "titles": {name: kind.title for name, kind in catalogue().items()}})
     progress(0, 1, "reading the bags")
-    prepared = _prepared(task["bags"], task["model"], *(task.get(k) for k in ("objects", "signals", "rig", "scale")))
+    prepared = _prepared(
+        task["bags"], task["model"], *(task.get(k) for k in ("objects", "signals", "rig", "scale"))
+    )
     progress(1, 1, "reading the bags")
     notes = list(prepared.notes)
     say({"kind": "data", "data": data_used(prepared.features), "notes": notes, "model": prepared.model.name})
@@ -127,7 +130,16 @@ def work(task: Mapping[str, Any], folder: Path, say: Say) -> None:
     verdict = verdict_of(**shown) if diagnosis or not after else _added(found, after)
     effects = [e.source or e.name for e in found.effects] if found else []
     words = {name: verdict[name] for name in ("kind", "label", "headline", "summary")}
-    say({"kind": "done", "action": action, "verdict": words, "effects": effects, "files": files, "command": command})
+    say(
+        {
+            "kind": "done",
+            "action": action,
+            "verdict": words,
+            "effects": effects,
+            "files": files,
+            "command": command,
+        }
+    )
 
 
 def _find(task: Mapping[str, Any], prepared: Any, executor: Any, progress: _Progress) -> Diagnosis | Addition:
