@@ -215,6 +215,7 @@ class _View:
             self.effects.props("outlined dense use-chips").classes("effects")
             self.progress = ui.html().props("aria-live=polite")
             self.answer = ui.element("div").classes("answer")
+        self._refresh()  # at once, so that no button can be pressed that would do nothing
         ui.timer(0.5, self._refresh)
 
     def _diagnose(self) -> None:
