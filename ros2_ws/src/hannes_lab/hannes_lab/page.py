@@ -48,7 +48,6 @@ class Round:
     text: str
     done: int
     total: int
-    began: float
 
 
 @dataclass
@@ -116,7 +115,10 @@ class Work:
             self._end_all(process)
             self.ended = time.monotonic()
         code = await process.wait()
-        await reading
+        try:
+            await reading
+        except ValueError as error:
+            self.problem = f"The worker process said what cannot be read: {error}."
         if code and self._cancelled:
             self.problem = "Cancelled. What was found is kept: the same button goes on from there."
         elif code and not self.problem:
@@ -130,9 +132,8 @@ class Work:
             os.killpg(process.pid, signal.SIGKILL)
 
     async def _listen(self, lines: asyncio.StreamReader, folder: Path) -> None:
-        while (line := await lines.readline()).endswith(
-            b"\n"
-        ):  # a process that is ended may leave half a line
+        # a process that is ended may leave half a line
+        while (line := await lines.readline()).endswith(b"\n"):
             message = json.loads(line)
             kind = message.pop("kind")
             if kind == "progress":
@@ -150,7 +151,7 @@ class Work:
     def _progress(self, done: int, total: int, text: str) -> None:
         last = self.rounds[-1] if self.rounds else None
         if last is None or last.text != text or done < last.done:
-            self.rounds.append(Round(text, done, total, time.monotonic()))
+            self.rounds.append(Round(text, done, total))
         else:
             last.done, last.total = done, total
 
@@ -189,10 +190,8 @@ class _View:
         self.work, self.ui = work, ui
         self._shown = 0
         self._titles: dict[str, str] = {}
-        style = (HERE / "static" / "report.css").read_text(encoding="utf-8")
-        ui.add_head_html(
-            f"<style>{style}\n{(HERE / 'static' / 'page.css').read_text(encoding='utf-8')}</style>"
-        )
+        for name in ("report.css", "page.css"):
+            ui.add_head_html(f"<style>{(HERE / 'static' / name).read_text(encoding='utf-8')}</style>")
         ui.colors(primary="#1264a8")
         with ui.element("main"):
             ui.html("<h1>Model against measurement</h1>")
@@ -331,19 +330,9 @@ def page(
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the link.")] = False,
 ) -> None:
     """Compare, diagnose and add in a web page of this machine."""
-    settings: dict[str, Any] = {
-        "bags": [str(b) for b in bags],
-        "model": model,
-        "rig": rig,
-        "objects": objects,
-    }
-    settings |= {
-        "scale": scale,
-        "signals": signals,
-        "max_effects": max_effects,
-        "greedy": greedy,
-        "jobs": jobs,
-    }
+    settings: dict[str, Any] = {"bags": [str(b) for b in bags], "model": model, "rig": rig, "jobs": jobs}
+    settings |= {"objects": objects, "scale": scale, "signals": signals}
+    settings |= {"max_effects": max_effects, "greedy": greedy}
     with tempfile.TemporaryDirectory(prefix="hannes_page_") as folder, listen(host, port) as listener:
         os.environ["NICEGUI_STORAGE_PATH"] = folder  # else NiceGUI would look for its own folder in this one
         serve(Work(settings, Path(folder)), listener, host, browser=not no_browser)
