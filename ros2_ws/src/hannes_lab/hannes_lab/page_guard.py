@@ -90,8 +90,8 @@ class Guard:
 
         try:
             await self.app(scope, noted, send)
-        except RuntimeError:
-            if not gone:  # a browser that closed the page before it was answered is no error
+        except (RuntimeError, KeyError):
+            if not gone:  # a browser that has left before it was answered is no error
                 raise
 
     def _at_home(self, scope: Scope, headers: Mapping[str, list[str]]) -> bool:
