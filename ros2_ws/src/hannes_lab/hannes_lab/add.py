@@ -31,7 +31,12 @@ class Addition:
     values: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
+        names = " and ".join(e.title for e in self.effects)
+        nominal = self.falls[1]
         return {
+            "verdict": "added",
+            "summary": f"With {names} the error on held-out closures falls from {nominal.held_out:.2f} "
+            f"({nominal.added}) to {self.falls[-1].held_out:.2f} times the repeatability.",
             "effects": [e.to_dict() for e in self.effects],
             "falls": [f.to_dict() for f in self.falls],
             "error": {

@@ -427,7 +427,7 @@ def add(
     ).save(out)
     if report:
         _write_report(
-            report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=None
+            report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
         )
     if json:
         _print_json(found.to_dict() | {"model_file": str(path)})
@@ -543,7 +543,7 @@ def report(
 
 
 def _write_report(
-    path: Path, *, comparison: Comparison, after: Comparison | None, diagnosis: Diagnosis | None
+    path: Path, *, comparison: Comparison, after: Comparison | None, diagnosis: Diagnosis | Addition | None
 ) -> None:
     from .report import write_report
 

@@ -117,8 +117,7 @@ def work(task: Mapping[str, Any], folder: Path, say: Say) -> None:
     comparison = _finite(before.to_dict())
     after = _finite(_after(prepared, found).to_dict()) if found else None
     answer = _finite(found.to_dict()) if found else comparison
-    diagnosis = answer if isinstance(found, Diagnosis) else None
-    shown: dict[str, Any] = {"comparison": comparison, "after": after, "diagnosis": diagnosis}
+    shown: dict[str, Any] = {"comparison": comparison, "after": after, "diagnosis": answer if found else None}
     command = command_line(task)
     files = [REPORT, ANSWER]
     write_report(folder / REPORT, **shown, title="Hannes: model against measurement", command=command)
@@ -127,7 +126,7 @@ def work(task: Mapping[str, Any], folder: Path, say: Say) -> None:
         model = replace(found.model, name=Path(MODEL).stem)
         with_provenance(model, prepared, found.falls, command).save(folder / MODEL)
         files.append(MODEL)
-    verdict = verdict_of(**shown) if diagnosis or not after else _added(found, after)
+    verdict = verdict_of(**shown)
     effects = [e.source or e.name for e in found.effects] if found else []
     words = {name: verdict[name] for name in ("kind", "label", "headline", "summary")}
     say(
@@ -158,17 +157,6 @@ def _find(task: Mapping[str, Any], prepared: Any, executor: Any, progress: _Prog
         max_effects=task["max_effects"],
         greedy=task["greedy"],
     )
-
-
-def _added(found: Any, after: Mapping[str, Any]) -> dict[str, Any]:
-    """The verdict on the model with what was added; its figures are those of the addition."""
-    nominal, last = found.falls[1], found.falls[-1]
-    titles = " and ".join(e.title for e in found.effects)
-    summary = (
-        f"With {titles} the error on held-out closures falls from {nominal.held_out:.2f} (nominal, fitted) to "
-        f"{last.held_out:.2f} times the repeatability."
-    )
-    return {**verdict_of(after, None, None), "label": "Added", "summary": summary}
 
 
 def command_line(task: Mapping[str, Any]) -> str:

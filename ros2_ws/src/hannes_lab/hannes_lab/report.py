@@ -133,7 +133,10 @@ def versions() -> dict[str, str]:
 
 
 def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> dict[str, Any]:
-    """Kind (the colour), one plain sentence, the reason, and the figures that matter."""
+    """Kind (the colour), one plain sentence, the reason, and the figures that matter.
+
+    diagnosis   what Diagnosis or Addition says of itself
+    """
     kind = str(diagnosis.get("verdict", "")) if diagnosis is not None else "comparison"
     names = [str(e.get("title") or text.words(e.get("name", ""))) for e in _list(diagnosis, "effects")]
     overall = text.known((comparison or {}).get("overall"))
@@ -143,6 +146,8 @@ def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | No
         headline = lacking(diagnosis, names)
     elif kind == "unknown":
         headline = "Something is missing that the catalogue does not hold."
+    elif kind == "added":
+        headline = f"The model has {text.listed(names)} now."
     elif kind != "comparison":
         headline, kind = f"Verdict: {kind or 'none was given'}.", "other"
     elif overall is None:
@@ -152,7 +157,7 @@ def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | No
                     if overall > 1.2 else
                     f"The model follows the closures to {text.ratio(overall)} times what they differ among themselves.")
     label = {"nothing": "Complete", "effects": "Effects found" if len(names) > 1 else "Effect found",
-             "unknown": "Unknown effect", "comparison": "Comparison"}.get(kind, "Verdict")
+             "unknown": "Unknown effect", "comparison": "Comparison", "added": "Added"}.get(kind, "Verdict")
     return {"kind": kind if kind in ("nothing", "effects", "unknown") else "other", "label": label,
             "headline": headline, "summary": str(diagnosis.get("summary", "")) if diagnosis is not None else "",
             "figures": _figures(comparison, after, diagnosis)}
