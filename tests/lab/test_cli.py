@@ -54,6 +54,10 @@ def test_diagnose_add_and_report(
     assert [e["name"] for e in content["effects"]] == ["glove_stiffness"]
     assert [e.name for e in Model.load(model).effects] == ["glove_stiffness"]
     assert "glove" in page.read_text(encoding="utf-8") and content["model_file"] == str(model)
+    words = ("add", str(bags), "--effect", "glove_stiffness", "--out", str(tmp_path / "added.yaml"))
+    code, _, _ = hannes(*words, "--jobs", "1", "--report", str(page), capsys=capsys, monkeypatch=monkeypatch)
+    text = page.read_text(encoding="utf-8")
+    assert code == 0 and "The model has glove stiffness now." in text and "How the error falls" in text
     # with the effect in the model, nothing is missing any more
     code, out, _ = hannes(
         "compare",
