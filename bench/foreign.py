@@ -119,9 +119,17 @@ def cases(tuning: bool) -> list[Case]:
     ]
     for k, (hidden, log, values) in enumerate(HIDDEN):
         factor = 1.2 if tuning else 1.0
-        values = tuple((n, v if n in ("waves", "glove_power", "spot_at") else v * factor) for n, v in values)
+        values = tuple((n, _stronger(n, v, factor)) for n, v in values)
         out.append(Case(hidden, log, values, first + 50 + k))
     return out
+
+
+def _stronger(name: str, value: float, factor: float) -> float:
+    """A value that departs `factor` times as far from what it is when nothing is hidden; shapes stay."""
+    if name in ("waves", "glove_power", "spot_at", "stiction_speed"):
+        return value
+    still = 1.0 if name in (*RELATIVE, "current_gain") else 0.0
+    return still + (value - still) * factor
 
 
 def record(case: Case, folder: Path) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from hannes_description.model import Model
+from hannes_sim.effect import load_effect
 from lab.foreign_bags import hannes
 
 
@@ -131,3 +132,53 @@ def test_a_mistake_gives_one_line_and_exit_code_2(
     assert code == 2
     assert message in err and "Traceback" not in err
     assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--effect", "load_dependent_friction=-1"), "coefficient would be -0.1"),
+        (("--effect", "cogging=0"), "but not 0"),
+        (("--effect", "cogging=inf"), "but not 0"),
+        (("--condition", "fast", "--condition", "fast"), "fast is asked for more than once"),
+        (("--seed", "-3"), "greater than or equal to 0"),
+    ],
+)
+def test_hide_refuses_what_would_hide_something_else(
+    words: tuple[str, ...],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    where = (str(tmp_path / "set"), "--truth", str(tmp_path / "truth.yaml"), "--closures", "1")
+    code, _, err = hannes("hide", *where, *words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 2 and said in " ".join(err.split())
+    assert not (tmp_path / "truth.yaml").exists()
+
+
+def test_effects_that_the_model_has_are_not_looked_for_in_silence(
+    bags: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = Model.load().with_effect(load_effect("cogging").entry()).save(tmp_path / "has.yaml")
+    for command, word in (("diagnose", "--only"), ("add", "--effect")):
+        code, _, err = hannes(
+            command, str(bags), word, "cogging", "--model", str(model), capsys=capsys, monkeypatch=monkeypatch
+        )
+        assert code == 2 and "in the model already" in " ".join(err.split())
+
+
+def test_a_signal_that_nobody_recorded_is_named_with_those_that_are_there(
+    bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("compare", str(bags), "--signal", "encoder_position", "--signal", "foo")
+    code, _, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 2 and "No recording has the signal foo; they have" in " ".join(err.split())
+
+
+def test_greedy_needs_two_conditions(
+    bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("diagnose", str(bags / "fast"), "--greedy", "--only", "cogging", "--jobs", "1")
+    code, _, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 2 and "there is one condition only" in " ".join(err.split())

@@ -102,6 +102,13 @@ def test_an_effect_that_a_later_one_made_superfluous_is_dropped() -> None:
     assert kept.best.penalised < both.penalised + limits.gain
 
 
+def test_one_closure_is_said_to_hold_nothing_out() -> None:
+    model = Model.load()
+    recordings, _ = make_set(model, [], seed=104, closures=1, conditions=("fast",))
+    found = diagnose(prepare([make_trial(r) for r in recordings], model), effect_sources(only=["gravity"]))
+    assert "nan" not in found.summary and "one closure of each condition only" in found.summary
+
+
 @pytest.mark.timeout(1200)  # the longest search: every round is tried before the answer is "unknown"
 def test_an_effect_outside_the_catalogue_is_called_unknown(tmp_path: Path) -> None:
     file = tmp_path / "latch.py"

@@ -268,7 +268,7 @@ def test_add_in_this_process(bags: Path, tmp_path: Path, store: Path) -> None:
     page_worker.work(task, tmp_path, said.append)
     done = said[-1]
     assert done["kind"] == "done" and done["verdict"]["label"] == "Added"
-    assert "With glove stiffness the error on held-out closures falls" in done["verdict"]["summary"]
+    assert "The error on held-out closures falls" in done["verdict"]["summary"]
     assert [e.name for e in Model.load(tmp_path / "my_hand.yaml").effects] == ["glove_stiffness"]
     with pytest.raises(HannesError, match="Unknown effect 'wire_slak'"):
         page_worker.work({**task, "effects": ["wire_slak"]}, tmp_path, said.append)

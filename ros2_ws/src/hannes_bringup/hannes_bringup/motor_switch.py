@@ -11,6 +11,7 @@ from hannes_description.errors import HannesError
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.context import Context
+from rclpy.exceptions import InvalidServiceNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
@@ -38,9 +39,14 @@ def switch(name: str, on: bool | None, timeout: float) -> str:
         asked = _Asked(node, executor, name, time.monotonic() + timeout)
         state = asked.state()
         steps = {} if on is None else UP if on else DOWN
-        while state in steps and asked.change(steps[state]):
+        while state in steps:
+            done = asked.change(steps[state])
             state = asked.state()
+            if not done:
+                break
         return state
+    except InvalidServiceNameException as error:
+        raise HannesError(f"'{name}' is no name of a node: {str(error).splitlines()[0]}") from error
     finally:
         executor.shutdown()
         node.destroy_node()

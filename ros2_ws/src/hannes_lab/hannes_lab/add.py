@@ -12,7 +12,7 @@ from hannes_sim.effect import load_effect
 from hannes_sim.plant import PlantDiverged
 
 from .chance import chance
-from .diagnose import Fall, FoundEffect, error_falls, fitted_model, found_effects
+from .diagnose import Fall, FoundEffect, error_falls, fall_sentence, fitted_model, found_effects
 from .executor import Executor
 from .features import data_used
 from .prepare import Prepared
@@ -31,12 +31,9 @@ class Addition:
     values: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
-        names = " and ".join(e.title for e in self.effects)
-        nominal = self.falls[1]
         return {
             "verdict": "added",
-            "summary": f"With {names} the error on held-out closures falls from {nominal.held_out:.2f} "
-            f"({nominal.added}) to {self.falls[-1].held_out:.2f} times the repeatability.",
+            "summary": fall_sentence(self.falls),
             "effects": [e.to_dict() for e in self.effects],
             "falls": [f.to_dict() for f in self.falls],
             "error": {
@@ -66,7 +63,8 @@ def add_effects(
     """
     if not sources:
         raise HannesError(
-            "No effect to add: give --effect NAME (see `hannes model effects`) or path.py:Class."
+            "No effect to add: those that were named are in the model already, or none was named; give --effect NAME "
+            "(see `hannes model effects`) or path.py:Class."
         )
     check_effects(prepared, sources)
     search = Search(

@@ -455,7 +455,7 @@ def hide(
         ),
     ] = None,
     model: ModelFile = "nominal",
-    seed: Annotated[int, typer.Option(help="Seed of hand, scatter and noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of hand, scatter and noise.")] = 0,
     closures: Annotated[int, typer.Option(min=1, help="Closures per condition.")] = 13,
     conditions: Annotated[
         list[str] | None,
@@ -483,6 +483,9 @@ def hide(
                 f"--effect {text}: give NAME or NAME=FACTOR with a number as the factor."
             ) from error
 
+    for given in wanted.items():
+        _check_factor(*given)
+
     def simulate(source: str) -> None:
         entry = strength_of(source, wanted[source])
         make_set(Model.load(model), [entry], seed=seed, closures=1, conditions=["fast"], scatter=0.0)
@@ -503,6 +506,18 @@ def hide(
         _print_json({"bags": [str(b) for b in bags], "truth": str(truth)})
         return
     typer.echo(f"{len(bags)} bags in {out}, the truth in {truth}")
+
+
+def _check_factor(source: str, factor: float) -> None:
+    """Refuse a strength that hides nothing, or another one than was asked for."""
+    main = load_effect(source).strength()
+    value = factor * main.typical
+    if not math.isfinite(factor) or factor == 0.0 or not main.lower <= value <= main.upper:
+        low, high = sorted((main.lower / main.typical, main.upper / main.typical))
+        raise HannesError(
+            f"--effect {source}={factor:g}: {main.name} would be {value:g} {main.unit}; its range is {main.lower:g} .. "
+            f"{main.upper:g}, factors {low:.3g} .. {high:.3g} but not 0."
+        )
 
 
 @interruptible

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from hannes_description.errors import HannesError
 from hannes_description.model import EffectEntry, Model
 from hannes_sim.effect import catalogue, effect_source, load_effect
 from numpy.typing import NDArray
@@ -44,7 +45,8 @@ WORTHWHILE = 0.05
 """A further effect must remove at least this part of the cost, and of the error on held-out conditions."""
 
 OWN_ERROR_PART = 0.1
-"""The same where the model has an error of its own, also within chance: its width is assumed, and it is not noise."""
+"""The same where the model has an error of its own, also within chance: its width is assumed, and it is not noise.
+There a second effect must remove FURTHER times as much."""
 
 TIE = 12.0
 """Sets whose penalised costs differ by less cannot be told apart: a likelihood ratio of e^6."""
@@ -60,6 +62,11 @@ FURTHER = 1.5
 
 FAR = 3.0
 """Standard deviations of its prior at which a nominal parameter is called far off."""
+
+NO_REPEATS = (
+    "There is one closure of each condition only: nothing could be held out, and how well the hand repeats itself is a "
+    "guess."
+)
 
 MAX_EFFECTS = 3
 
@@ -218,6 +225,10 @@ def diagnose(
     greedy   add effects one after another as long as the error on held-out conditions falls (greedy.py), instead of
              looking for the smallest set that explains all
     """
+    if not sources:
+        raise HannesError(
+            "There is no effect to look for: those that were named are in the model already, or none was named."
+        )
     usable = usable_effects(prepared, sources)
     sources = usable.sources
     prepared = replace(prepared, notes=(*prepared.notes, *usable.notes))
@@ -292,6 +303,11 @@ class _Choice:
 
 def _grow(search: Search, null: Candidate, limits: Chance, max_effects: int) -> _Choice:
     """Effects one after another while the error on held-out conditions falls by at least WORTHWHILE."""
+    if len(search.problem.features.conditions) < 2:
+        raise HannesError(
+            "--greedy judges by conditions that took no part in the fit, and there is one condition only: record "
+            "another speed or a grasp, or leave --greedy out."
+        )
     grown = grow(search, null, max_effects, WORTHWHILE)
     cost = grown.best.fit.cost
     adequate = _adequate(search, grown.best, limits)
@@ -329,7 +345,7 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         if not round_:
             break
         ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in round_)
-        if enough and round_[0].penalised < worth:
+        if enough and round_[0].penalised < worth and set(choice.best.names) < set(round_[0].names):
             # The set without it may find its way further down from there; what is left is the gain.
             choice = replace(choice, best=choice.search.without(round_[0], choice.best.names))
         # What chance gains was found for effects of one free strength; further parameters pay their penalty.
@@ -359,7 +375,7 @@ def _adequate(search: Search, candidate: Candidate, limits: Chance) -> bool:
 
 
 def _needed(choice: _Choice, base: Candidate, *, first: bool = False) -> float:
-    """By how much a further effect must lower the penalised cost of a base; `first`: the base has none."""
+    """By how much a further effect must lower the penalised cost of a base; `first`: it is the first of the search."""
     limits = choice.limits
     enough = base.fit.cost <= limits.misfit
     part = OWN_ERROR_PART if choice.search.problem.discrepancy else 0.0 if enough else WORTHWHILE
@@ -377,7 +393,15 @@ def _pruned(choice: _Choice) -> _Choice:
         gain = part.penalised + PENALTY - best.penalised
         if gain >= _needed(choice, part) or not _adequate(choice.search, part, choice.limits):
             break
-        choice = replace(choice, best=part, rivals=())
+        alike = [
+            c
+            for names, c in choice.search.found.items()
+            if len(names) == len(part.names)
+            and set(names) != set(part.names)
+            and c.penalised <= part.penalised + TIE
+            and _adequate(choice.search, c, choice.limits)
+        ]
+        choice = replace(choice, best=part, rivals=tuple(alike))
     return choice
 
 
@@ -611,6 +635,17 @@ def _moved_far(best: Candidate) -> str:
     )
 
 
+def fall_sentence(falls: Sequence[Fall]) -> str:
+    """How the error on held-out closures falls; says so where there is one closure only."""
+    before, after = falls[1].held_out, falls[-1].held_out
+    if not np.isfinite([before, after]).all():
+        return NO_REPEATS
+    return (
+        f"The error on held-out closures falls from {before:.2f} (nominal, fitted) to {after:.2f} times the "
+        "repeatability."
+    )
+
+
 def _summary(
     verdict: str,
     effects: Sequence[FoundEffect],
@@ -619,15 +654,16 @@ def _summary(
     limits: Chance,
     best: Candidate,
 ) -> str:
-    fall = (
-        f"The error on held-out closures falls from {falls[1].held_out:.2f} (nominal, fitted) to "
-        f"{falls[-1].held_out:.2f} times the repeatability."
-    )
+    fall = fall_sentence(falls)
     if verdict == "nothing":
         return (
             f"Nothing is missing: with its own parameters fitted, the model's misfit {best.fit.cost:.0f} is below what "
             f"chance reaches ({limits.misfit:.0f}), and no effect of the catalogue gains more than chance would. "
-            f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability."
+            + (
+                f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability."
+                if np.isfinite(falls[-1].held_out)
+                else NO_REPEATS
+            )
             + _moved_far(best)
         )
     names = " and ".join(e.title for e in effects)

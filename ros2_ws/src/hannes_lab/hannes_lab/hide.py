@@ -187,7 +187,14 @@ def write_set(
     folder, truth_file = Path(folder), Path(truth_file)
     if truth_file.exists():
         raise HannesError(f"The truth file '{truth_file}' exists already; give another name.")
+    names = [str(r.metadata["condition"]) for r in recordings]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise HannesError(f"Condition {', '.join(twice)} is asked for more than once; name each once.")
+    try:
+        truth_file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HannesError(f"No folder '{truth_file.parent}' for the truth: {error.strerror or error}.") from error
     bags = [write_recording(r, folder / str(r.metadata["condition"]), compression="zstd") for r in recordings]
-    truth_file.parent.mkdir(parents=True, exist_ok=True)
     truth_file.write_text(yaml.safe_dump(truth.to_dict(), sort_keys=False), encoding="utf-8")
     return bags

@@ -64,11 +64,14 @@ def look_alikes(names: Sequence[str], model: Model | None = None) -> dict[str, L
     clean = {name: [left(shape) for shape in shapes] for name, shapes in raw.items()}
     out = {}
     for name, shapes in raw.items():
+        if not shapes:
+            out[name] = LookAlikes({}, 0.0, "nothing")
+            continue
         # The first shape start and strength are the typical ones.
         whole, rest = shapes[0][:, 0], clean[name][0][:, 0]
-        alone = np.abs(whole @ null.jacobian) / np.linalg.norm(null.jacobian, axis=0)
+        alone = np.abs(whole @ null.jacobian) / np.sqrt((null.jacobian**2).sum(axis=0) + 1.0)
         out[name] = LookAlikes(
-            {b: max(_imitated(rest, s) for s in clean[b]) for b in clean if b != name},
+            {b: max((_imitated(rest, s) for s in clean[b]), default=0.0) for b in clean if b != name},
             1.0 - float(rest @ rest / (whole @ whole)),
             null.coordinates[int(np.argmax(alone))].name,
         )
@@ -76,7 +79,7 @@ def look_alikes(names: Sequence[str], model: Model | None = None) -> dict[str, L
 
 
 def _signatures(search: Search, name: str) -> list[Array]:
-    """Per shape start, changes (size, k) that the strengths make, each scaled to VISIBLE; the typical one first."""
+    """Per shape start, changes (size, k) that the strengths make, none much above VISIBLE; the typical one first."""
     null = search.null().fit
     kind = search.effect(name)
     model, coordinates = search.with_effects((name,))

@@ -82,6 +82,13 @@ def _try(source: str, simulate: Simulate, motion: tuple[Array, Array], answer: C
     answer.close()
 
 
+def _acts_switched_off(kind: EffectType, x: Array) -> bool:
+    off = np.array([p.typical if p.vanishing is None else p.vanishing for p in kind.parameters])
+    y = np.zeros(N_OUTPUTS)
+    kind.contribute(x, off, np.zeros(max(kind.states, 1)), y)
+    return bool(np.any(np.abs(y) > 1e-12))
+
+
 def _without_number(kind: EffectType, source: str, time: Array, position: Array) -> str:
     """A sentence if contribute gives NaN, infinity or an error along a motion; "" if it gives numbers.
 
@@ -99,6 +106,11 @@ def _without_number(kind: EffectType, source: str, time: Array, position: Array)
             wrong = "" if np.isfinite(y).all() and np.isfinite(s).all() else "NaN or infinity"
         except (ArithmeticError, ValueError, IndexError) as error:
             wrong = f"no number ({error})"
+        if not wrong and kind.parameters and _acts_switched_off(kind, x):
+            return (
+                f"'{source}': with its parameters at their vanishing values it still acts, at position {q:.4g}, "
+                f"velocity {v:.4g}. An effect that is switched off must add nothing."
+            )
         if wrong:
             return (
                 f"'{source}': contribute(x, p, s, y) gives {wrong} at position {q:.4g}, velocity {v:.4g} with its "

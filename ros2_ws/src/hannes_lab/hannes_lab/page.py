@@ -24,6 +24,7 @@ from typing import Annotated, Any
 
 import typer
 from hannes_description.errors import HannesError
+from hannes_description.model import Model
 
 from .cli import _JOBS, Bags, Greedy, Jobs, MaxEffects, ModelFile, Objects, RigFile, Scale, Signals
 from .diagnose import MAX_EFFECTS
@@ -117,7 +118,7 @@ class Work:
         code = await process.wait()
         try:
             await reading
-        except ValueError as error:
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
             self.problem = f"The worker process said what cannot be read: {error}."
         if code and self._cancelled:
             self.problem = "Cancelled. What was found is kept: the same button goes on from there."
@@ -218,7 +219,8 @@ class _View:
         ui.timer(0.5, self._refresh)
 
     def _diagnose(self) -> None:
-        chosen, only = list(self.effects.value), bool(self.only.value)
+        chosen = list(self.effects.value)
+        only = bool(self.only.value and chosen)
         # the catalogue takes part anyway
         self.work.start("diagnose", effects=[e for e in chosen if only or ":" in e], only=only)
 
@@ -330,6 +332,11 @@ def page(
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Only print the link.")] = False,
 ) -> None:
     """Compare, diagnose and add in a web page of this machine."""
+    for bag in bags:
+        if not bag.exists():
+            raise HannesError(f"No bag '{bag}': the path does not exist.")
+    if rig is None:
+        Model.load(model)  # so that a wrong name is said here, not on the page
     settings: dict[str, Any] = {"bags": [str(b) for b in bags], "model": model, "rig": rig, "jobs": jobs}
     settings |= {"objects": objects, "scale": scale, "signals": signals}
     settings |= {"max_effects": max_effects, "greedy": greedy}

@@ -145,8 +145,6 @@ def _find(task: Mapping[str, Any], prepared: Any, executor: Any, progress: _Prog
     wanted, model = task.get("effects") or [], prepared.model
     if task["action"] == "add":
         sources = effect_sources(only=wanted, model=model)
-        if wanted and not sources:
-            raise HannesError(f"The model has {', '.join(wanted)} already; choose other effects.")
         return add_effects(prepared, sources, executor=executor, progress=progress)
     only = wanted if task.get("only") else None
     return diagnose(

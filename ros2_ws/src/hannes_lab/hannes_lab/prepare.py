@@ -123,6 +123,12 @@ def prepare(
     rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
     known = dict.fromkeys((*SIGNALS, "motor_effort", *(s for t in trials for s in t.signals)))
     present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
+    unknown = [s for s in signals or () if s not in present]
+    if unknown:
+        there = dict.fromkeys(s for t in trials for s in t.signals)
+        raise HannesError(
+            f"No recording has the signal {', '.join(unknown)}; they have {', '.join(there)}."
+        )
     features = build_features(trials, present, rig.points)
     nuisances = tuple(rig.nuisances(model))
     coordinates = [nuisance_coordinate(n) for n in nuisances]

@@ -243,6 +243,7 @@ class PlantRig:
         if key in self._signals:
             self._signals.move_to_end(key)
         else:
+            self._came_back = True
             signals = self.observed(model, values, trial, reference)
             if not self._came_back and reference.size < trial.reference.size:
                 signals = self.observed(model, values, trial, trial.reference)

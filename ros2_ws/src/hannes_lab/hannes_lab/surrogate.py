@@ -74,7 +74,7 @@ class AnchoredRig:
         return AnchoredRig(self.exact, model, values, self._slopes, self._corrections)
 
     def sloped(self, coordinates: Sequence[Coordinate]) -> AnchoredRig:
-        """The same with the slow plant's slopes at the anchor for these coordinates, one slow simulation each."""
+        """The same with the slow plant's slopes at the anchor for these coordinates."""
         slopes = dict(self._slopes)
         for c in coordinates:
             slopes[c.name] = self._slope(c)
