@@ -272,7 +272,7 @@ def test_add_in_this_process(bags: Path, tmp_path: Path, store: Path) -> None:
     assert [e.name for e in Model.load(tmp_path / "my_hand.yaml").effects] == ["glove_stiffness"]
     with pytest.raises(HannesError, match="Unknown effect 'wire_slak'"):
         page_worker.work({**task, "effects": ["wire_slak"]}, tmp_path, said.append)
-    with pytest.raises(HannesError, match="has glove_stiffness already"):
+    with pytest.raises(HannesError, match="in the model already"):
         page_worker.work({**task, "model": str(tmp_path / "my_hand.yaml")}, tmp_path, said.append)
 
 
