@@ -28,7 +28,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 sys.path.insert(0, str(Path(__file__).parent))
-from identification import source_hash
+import identification
+from identification import kept, source_hash
 from other_hand import TICK, Hand, closures
 
 SPREAD = {
@@ -219,21 +220,10 @@ def run_case(case: Case) -> dict[str, Any]:
 
 
 def as_hidden(result: dict[str, Any]) -> bool:
-    """Nothing, unknown, or the hidden effects themselves, alone or in a tie."""
-    if not result["hidden"]:
-        return bool(result["verdict"] == "nothing")
-    if result["hidden"][0] in OUTSIDE:
+    """As in identification.py; what is in no catalogue must be called unknown."""
+    if result["hidden"] and result["hidden"][0] in OUTSIDE:
         return bool(result["verdict"] == "unknown")
-    return result["hidden"] in (result["tied"] or [result["named"]])
-
-
-def _kept(case: Case, file: Path) -> dict[str, Any]:
-    if not file.exists():
-        temporary = file.with_suffix(".tmp")
-        temporary.write_text(json.dumps(run_case(case)))
-        temporary.replace(file)
-    result: dict[str, Any] = json.loads(file.read_text())
-    return result
+    return identification.as_hidden(result)
 
 
 def main() -> int:
@@ -247,7 +237,7 @@ def main() -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     todo = cases(options.tuning)
     runs = Parallel(n_jobs=options.jobs, return_as="generator")(
-        delayed(_kept)(c, options.out / f"{c.key}.json") for c in todo
+        delayed(kept)(run_case, c, options.out / f"{c.key}.json") for c in todo
     )
     results = []
     for k, r in enumerate(runs):

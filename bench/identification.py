@@ -21,6 +21,7 @@ import itertools
 import json
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -404,7 +405,7 @@ def main() -> int:
             missing.append((case, file))
     print(f"{len(todo)} sets, {len(results)} kept from before", file=sys.stderr)
     runs = Parallel(n_jobs=options.jobs, return_as="generator_unordered")(
-        delayed(_kept)(c, f) for c, f in missing
+        delayed(kept)(run_case, c, f) for c, f in missing
     )
     for k, result in enumerate(runs):
         results.append(result)
@@ -430,12 +431,14 @@ def main() -> int:
     return 0
 
 
-def _kept(case: Case, file: Path) -> dict[str, Any]:
+def kept(run: Callable[[Any], dict[str, Any]], case: Any, file: Path) -> dict[str, Any]:
+    """The result of a case: from its file if it is there, else made and written there."""
     sys.path.insert(0, str(OUTSIDE.parent))
-    result = run_case(case)
-    temporary = file.with_suffix(".tmp")
-    temporary.write_text(json.dumps(result))
-    temporary.replace(file)
+    if not file.exists():
+        temporary = file.with_suffix(".tmp")
+        temporary.write_text(json.dumps(run(case)))
+        temporary.replace(file)
+    result: dict[str, Any] = json.loads(file.read_text())
     return result
 
 

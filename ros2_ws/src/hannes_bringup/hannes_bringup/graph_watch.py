@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import os
 import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.executors import Executor
@@ -17,6 +15,8 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+
+from .visitor import visit
 
 QUIET, LONGEST = 0.5, 3.0
 """s: discovery is over when no topic or node was added for QUIET, or after LONGEST."""
@@ -79,26 +79,8 @@ class _Arrivals:
 
 def watch(window: float, context: Context | None = None) -> GraphSeen:
     """Watch the graph for `window` seconds (plus discovery), without disturbing it: best-effort, raw subscriptions."""
-    own = context is None
-    if context is None:
-        context = Context()
-        rclpy.init(args=[], context=context)
-    node = Node(
-        f"_hannes_nodes_{os.getpid()}",
-        context=context,
-        use_global_arguments=False,
-        enable_rosout=False,
-        start_parameter_services=False,
-    )
-    executor = EventsExecutor(context=context)
-    executor.add_node(node)
-    try:
+    with visit("nodes", EventsExecutor, context) as (node, executor):
         return _watch(node, executor, window)
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        if own:
-            rclpy.try_shutdown(context=context)
 
 
 def _watch(node: Node, executor: Executor, window: float) -> GraphSeen:

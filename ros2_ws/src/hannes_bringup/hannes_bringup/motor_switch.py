@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import time
 from typing import Any
 
-import rclpy
 from hannes_description.errors import HannesError
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from rclpy.context import Context
 from rclpy.exceptions import InvalidServiceNameException
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
+
+from .visitor import visit
 
 UP = {"unconfigured": Transition.TRANSITION_CONFIGURE, "inactive": Transition.TRANSITION_ACTIVATE}
 DOWN = {"active": Transition.TRANSITION_DEACTIVATE}
@@ -24,39 +23,25 @@ def switch(name: str, on: bool | None, timeout: float) -> str:
 
     Raises HannesError where no such node answers within `timeout` seconds.
     """
-    context = Context()
-    rclpy.init(args=[], context=context)
-    node = Node(
-        f"_hannes_motor_{os.getpid()}",
-        context=context,
-        use_global_arguments=False,
-        enable_rosout=False,
-        start_parameter_services=False,
-    )
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    try:
+    with visit("motor", SingleThreadedExecutor) as (node, executor):
         asked = _Asked(node, executor, name, time.monotonic() + timeout)
-        state = asked.state()
-        steps = {} if on is None else UP if on else DOWN
-        while state in steps:
-            done = asked.change(steps[state])
+        try:
             state = asked.state()
-            if not done:
-                break
-        return state
-    except InvalidServiceNameException as error:
-        raise HannesError(f"'{name}' is no name of a node: {str(error).splitlines()[0]}") from error
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
+            steps = {} if on is None else UP if on else DOWN
+            while state in steps:
+                done = asked.change(steps[state])
+                state = asked.state()
+                if not done:
+                    break
+            return state
+        except InvalidServiceNameException as error:
+            raise HannesError(f"'{name}' is no name of a node: {str(error).splitlines()[0]}") from error
 
 
 class _Asked:
     """The lifecycle services of one node."""
 
-    def __init__(self, node: Node, executor: SingleThreadedExecutor, name: str, until: float) -> None:
+    def __init__(self, node: Node, executor: Executor, name: str, until: float) -> None:
         self._node, self._executor, self._name, self._until = node, executor, name, until
 
     def state(self) -> str:

@@ -30,6 +30,7 @@ from .cli import _JOBS, Bags, Greedy, Jobs, MaxEffects, ModelFile, Objects, RigF
 from .diagnose import MAX_EFFECTS
 from .page_guard import Guard, address_of
 from .page_worker import ANSWER, GRACE_S, MODEL, REPORT
+from .prepare import existing
 
 HERE = Path(__file__).parent
 
@@ -333,8 +334,7 @@ def page(
 ) -> None:
     """Compare, diagnose and add in a web page of this machine."""
     for bag in bags:
-        if not bag.exists():
-            raise HannesError(f"No bag '{bag}': the path does not exist.")
+        existing(bag)
     if rig is None:
         Model.load(model)  # so that a wrong name is said here, not on the page
     settings: dict[str, Any] = {"bags": [str(b) for b in bags], "model": model, "rig": rig, "jobs": jobs}

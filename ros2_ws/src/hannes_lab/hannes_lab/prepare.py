@@ -38,13 +38,19 @@ class Prepared:
     notes: tuple[str, ...]
 
 
+def existing(given: str | Path) -> Path:
+    """The path, if there is something at it."""
+    path = Path(given)
+    if not path.exists():
+        raise HannesError(f"No bag '{given}': the path does not exist.")
+    return path
+
+
 def find_bags(paths: Sequence[str | Path]) -> list[Path]:
     """Bags below the given paths: a bag (folder with metadata.yaml, .mcap, .db3) or a folder of bags."""
     out: list[Path] = []
     for given in paths:
-        path = Path(given)
-        if not path.exists():
-            raise HannesError(f"No bag '{given}': the path does not exist.")
+        path = existing(given)
         if path.is_dir() and not (path / "metadata.yaml").exists() and not _storage(path):
             below = sorted(
                 p for p in path.iterdir() if p.is_dir() and ((p / "metadata.yaml").exists() or _storage(p))
