@@ -1,4 +1,4 @@
-"""A real machine, the EMPS bench: `python bench/emps.py [DATA_EMPS.mat] [--jobs N]`.
+"""A real machine, the EMPS bench: `python bench/emps.py [DATA_EMPS.mat] [--jobs N] [--picture FILE]`.
 
 Grows a model from mass and viscous friction by `--greedy` and prints what each effect is worth on moves that took no
 part in its fit: by closed-loop simulation, and of the force by inverse dynamics (then fitted so).  The data are not
@@ -13,10 +13,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
 import numpy as np
 from hannes_description.model import Model
 from hannes_lab.cache import Store
-from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.diagnose import Diagnosis, diagnose, effect_sources
+from hannes_lab.errors import pooled_repeatability
 from hannes_lab.executor import Executor
 from hannes_lab.inverse import force_residual, rows
 from hannes_lab.prepare import Prepared, prepare
@@ -69,6 +74,26 @@ def left_out(
     return values(whole), float(np.sqrt(power / ticks))
 
 
+def draw(found: Diagnosis, repeats: dict[str, float], path: Path) -> None:
+    """Error of both signals on moves left out, as effects are added; dashed the repeatability from lap to lap."""
+    falls = found.falls[1:]
+    labels = ["mass + viscous", *(f"+ {fall.added.replace('_', ' ')}" for fall in falls[1:])]
+    figure, axes = plt.subplots(1, 2, figsize=(11, 3.8), sharey=True, layout="constrained")
+    for ax, (signal, unit, factor) in zip(
+        axes, (("drive_force", "N", 1.0), ("encoder_position", "µm", 1e6)), strict=True
+    ):
+        errors = [factor * fall.held_out_signals[signal] for fall in falls]
+        bars = ax.barh(labels, errors, height=0.5, color="#1064ab")
+        ax.bar_label(bars, [f"{e:.2f}" for e in errors], padding=4)
+        ax.axvline(factor * repeats[signal], color="#117a44", linestyle="--", label="repeatability from lap to lap")
+        ax.set_title(f"{signal.replace('_', ' ')}, {unit}", loc="left")
+        ax.set_xlim(0.0, 1.12 * max(errors))
+        ax.spines[["top", "right"]].set_visible(False)
+    axes[0].invert_yaxis()
+    axes[1].legend(frameon=False, loc="lower right")
+    figure.savefig(path, dpi=100)
+
+
 def _slopes(residual: Callable[[Array], Array], z: Array, steps: Array, high: Array) -> Array:
     here = residual(z)
     columns = []
@@ -84,6 +109,7 @@ def main() -> int:
     )
     parser.add_argument("data", nargs="?", type=Path, default=DATA)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--picture", type=Path, help="draw the fall of the error into this file, too")
     options = parser.parse_args()
     if not options.data.is_file():
         print(f"no {options.data}: nothing is measured; give the path of DATA_EMPS.mat", file=sys.stderr)
@@ -103,6 +129,8 @@ def main() -> int:
         )
     print(f"mass {found.values['motor.armature']:.2f} kg, {len(names)} effects", end="")
     print(f", ripple {1e3 * found.values['cogging.period']:.4f} mm" if "cogging" in names else "")
+    if options.picture:
+        draw(found, pooled_repeatability(prepared.features), options.picture)
     return 0
 
 

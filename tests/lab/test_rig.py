@@ -75,6 +75,14 @@ def test_effects_without_a_meaning_are_not_offered(prepared: Prepared) -> None:
     assert any("wire_slack" in note and "move none" in note for note in usable.notes)
 
 
+def test_an_effect_that_acts_on_another_is_offered(prepared: Prepared) -> None:
+    """The model has no dry friction of which there could be less at rest, but it may get some."""
+    sources = effect_sources(only=["velocity_strengthening", "coulomb_friction"])
+    assert set(usable_effects(prepared, sources).sources) == set(sources)
+    alone = usable_effects(prepared, effect_sources(only=["velocity_strengthening"]))
+    assert not alone.sources and "velocity_strengthening would move none" in alone.notes[0]
+
+
 def test_a_ripple_is_seen_in_the_spectrum_over_the_position(prepared: Prepared) -> None:
     from hannes_lab.search import Search
 

@@ -20,6 +20,7 @@ EXPECTED = {
     "viscous_friction",
     "coulomb_friction",
     "stribeck_friction",
+    "velocity_strengthening",
     "load_dependent_friction",
     "direction_dependent_friction",
     "wire_slack",
@@ -99,6 +100,10 @@ def test_equations_by_hand() -> None:
     assert evaluate(load_effect("stribeck_friction"), stribeck, {V: 2.0})[FRICTION] == pytest.approx(
         0.02 / math.e
     )
+    rising = {"level": 0.02, "velocity": 0.1}
+    assert [
+        evaluate(load_effect("velocity_strengthening"), rising, {V: v})[FRICTION] for v in (0.0, 0.1, 2.0)
+    ] == pytest.approx([-0.02, -0.02 / math.e, 0.0])
     assert evaluate(load_effect("load_dependent_friction"), {"coefficient": 0.1}, {LOAD: 0.3})[
         FRICTION
     ] == pytest.approx(0.03)

@@ -48,8 +48,12 @@ OWN_ERROR_PART = 0.1
 """The same where the model has an error of its own, also within chance: its width is assumed, and it is not noise.
 There a second effect must remove FURTHER times as much."""
 
-TIE = 12.0
-"""Sets whose penalised costs differ by less cannot be told apart: a likelihood ratio of e^6."""
+TIE = 6.0
+"""Sets whose penalised costs differ by less cannot be told apart: a likelihood ratio of e^3 = 20.  The best is the
+wrong one beyond it in 0.7 % at worst, of sets that are as far apart as that (normal tail at the root of 6)."""
+
+OWN_ERROR_TIE = 12.0
+"""The same where the model has an error of its own."""
 
 HOPELESS = 10.0
 """Sets whose cost is so many times that of the best are not followed."""
@@ -363,7 +367,7 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         near = sorted(new.refitted(rivals), key=lambda c: c.penalised)
         best = new.polish(near[0])
         limits_new = chance(new.problem, best.fit, new.signatures(best))
-        close = tuple(c for c in near[1:] if c.penalised <= best.penalised + TIE)
+        close = tuple(c for c in near[1:] if c.penalised <= best.penalised + _tie(new))
         adequate = _adequate(new, best, limits_new)
         choice = _Choice(new, best, limits_new, adequate, ranking, close)
         front, far = [best, *near[1:]], [c for c in wide if c not in rivals]
@@ -372,6 +376,10 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
 
 def _adequate(search: Search, candidate: Candidate, limits: Chance) -> bool:
     return candidate.fit.cost <= limits.misfit * (1.0 if search.problem.discrepancy else ADEQUATE)
+
+
+def _tie(search: Search) -> float:
+    return OWN_ERROR_TIE if search.problem.discrepancy else TIE
 
 
 def _needed(choice: _Choice, base: Candidate, *, first: bool = False) -> float:
@@ -398,7 +406,7 @@ def _pruned(choice: _Choice) -> _Choice:
             for names, c in choice.search.found.items()
             if len(names) == len(part.names)
             and set(names) != set(part.names)
-            and c.penalised <= part.penalised + TIE
+            and c.penalised <= part.penalised + _tie(choice.search)
             and _adequate(choice.search, c, choice.limits)
         ]
         choice = replace(choice, best=part, rivals=tuple(alike))

@@ -120,6 +120,15 @@ def is_described(trial: Trial) -> bool:
     return isinstance(trial.options.get("sensors"), Mapping)
 
 
+def is_of(trial: Trial, model: Model) -> bool:
+    """True where the recording says that it was made by the plant of the model, or says how it was logged and no more.
+
+    To any other machine the model is an approximation: it has an error of its own, and parameters that stand for more
+    than one thing (an object's place and stiffness as the pulley feels them, the wire's stiffness) are not known.
+    """
+    return is_described(trial) and trial.options.get("plant", model.plant) == model.plant
+
+
 class HandRig(PlantRig):
     """Simulates trials of the hand, on whichever plant the model names: objects, sensors and encoder zero per trial.
 
@@ -152,7 +161,7 @@ class HandRig(PlantRig):
                     if object_of(trial) is None:
                         continue
                     plant, _, _ = self._plant(model.without_effects(), trial)
-                    known = is_described(trial) and not trial.options.get("object_seen")
+                    known = is_of(trial, model) and not trial.options.get("object_seen")
                     width = sd if known else _UNKNOWN_OBJECT_SD[name]
                     step = 0.5 if known else WIDE_STEP
                     place = f"{name}@{trial.name}"
@@ -199,7 +208,8 @@ class HandRig(PlantRig):
                 for name, sd in _UNKNOWN_GAINS.items()
                 if means[name] > 0.0
             ]
-        known = self._plant(model.without_effects(), strange[0])[0].names if strange else ()
+        other = [trial for trial in self.trials if not is_of(trial, model)]
+        known = self._plant(model.without_effects(), other[0])[0].names if other else ()
         if _WIRE in known and model.parameters.value(_WIRE) > 0.0:
             unit = model.parameters[_WIRE].unit
             out.append(Nuisance(_WIRE, model.parameters.value(_WIRE), _UNKNOWN_WIRE_SD, True, unit=unit))
@@ -213,10 +223,10 @@ class HandRig(PlantRig):
         ]
         return out
 
-    def own_error(self, block: Block) -> Array:
-        """See Rig: none for a recording that this simulator's chain describes."""
+    def own_error(self, block: Block, model: Model) -> Array:
+        """See Rig: none for a recording of this plant, as its description says."""
         trial = self.trials[block.trial]
-        if is_described(trial):
+        if is_of(trial, model):
             return np.zeros(block.phase.size)
         span = float(np.ptp(block.measured)) or 1.0
         sd = np.full(block.phase.size, OWN_ERROR.get(block.signal, OWN_ERROR_DRIVE) * span)

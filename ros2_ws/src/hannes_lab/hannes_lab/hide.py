@@ -176,6 +176,7 @@ def _record(
         "closures": closures,
         "object": spec.grasp,
         "sensors": sensors.to_dict(),
+        "plant": model.plant,
     }
     return Recording(channels, metadata, spec.name)
 

@@ -2,7 +2,8 @@
 
 An effect's signature is the change of the whitened residual that it makes on data in which nothing is missing, with
 what the nuisance parameters can take over projected out (against their priors).  B imitates A by the cosine between
-A's signature and its projection onto what B's strengths can do, at the best of B's shape starts.
+A's signature and its projection onto what B's strengths can do inside their bounds (a friction cannot be negative), at
+the best of B's shape starts.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from hannes_description.model import Model
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from .diagnose import effect_sources
 from .hide import make_set
@@ -79,7 +81,10 @@ def look_alikes(names: Sequence[str], model: Model | None = None) -> dict[str, L
 
 
 def _signatures(search: Search, name: str) -> list[Array]:
-    """Per shape start, changes (size, k) that the strengths make, none much above VISIBLE; the typical one first."""
+    """Per shape start, changes (size, k) that the strengths make, none much above VISIBLE; the typical one first.
+
+    A strength that may go both ways has a column for each.
+    """
     null = search.null().fit
     kind = search.effect(name)
     model, coordinates = search.with_effects((name,))
@@ -108,12 +113,12 @@ def _signatures(search: Search, name: str) -> list[Array]:
                     break
                 factor *= VISIBLE / size
             if np.linalg.norm(change) > 0.0:
-                columns.append(change)
+                columns += [change, -change] if p.lower < vanishing < p.upper else [change]
         if columns:
             out.append(np.column_stack(columns))
     return out
 
 
 def _imitated(rest: Array, columns: Array) -> float:
-    q, _ = np.linalg.qr(columns)
-    return float(np.linalg.norm(q.T @ rest) / np.linalg.norm(rest))
+    strengths, _ = nnls(columns, rest)
+    return float(np.linalg.norm(columns @ strengths) / np.linalg.norm(rest))

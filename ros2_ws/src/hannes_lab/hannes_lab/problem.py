@@ -264,7 +264,7 @@ def build_problem(
                 continue
             covariance = single / count
             if part[0][1] == 0:
-                own_error = _own_error([features.blocks[k] for k in own], rig)
+                own_error = _own_error([features.blocks[k] for k in own], rig, model)
                 if own_error.any():
                     covariance = covariance + own_error
                     discrepancy.append((rows, np.asarray(np.linalg.cholesky(own_error), dtype=np.float64)))
@@ -272,12 +272,12 @@ def build_problem(
     return Problem(rig, features, tuple(whitener), tuple(deviations), counts or Counts(), tuple(discrepancy))
 
 
-def _own_error(blocks: Sequence[Block], rig: Rig) -> Array:
+def _own_error(blocks: Sequence[Block], rig: Rig, model: Model) -> Array:
     """Covariance of the model's own error over the phases of these blocks, one after another; zero if it has none."""
     out = np.zeros((sum(b.phase.size for b in blocks),) * 2)
     at = 0
     for block in blocks:
-        sd = rig.own_error(block)
+        sd = rig.own_error(block, model)
         length = DISCREPANCY_LENGTH * float(block.phase[-1] - block.phase[0])
         apart = np.abs(block.phase[:, None] - block.phase[None, :]) / length
         own = slice(at, at + block.phase.size)

@@ -114,7 +114,7 @@ class Rig(Protocol):
     def nuisances(self, model: Model) -> Sequence[Nuisance]:
         """The uncertain nominal parameters with their priors."""
 
-    def own_error(self, block: Block) -> Array:
+    def own_error(self, block: Block, model: Model) -> Array:
         """Standard deviation (p,) of the model's own error over the phases of a block, in the signal's unit.
 
         No model has exactly the machine's form: so far the best parameters may leave it.  0: any difference counts.
@@ -203,7 +203,7 @@ class PlantRig:
             return Nuisance(name, mean, sd * mean, False, scatter * mean, unit, lower=LEAST * mean)
         return Nuisance(name, mean, sd, relative, scatter, unit)
 
-    def own_error(self, block: Block) -> Array:
+    def own_error(self, block: Block, model: Model) -> Array:
         """See Rig."""
         return np.zeros(block.phase.size)
 

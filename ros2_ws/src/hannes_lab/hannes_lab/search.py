@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 Names = tuple[str, ...]
 
-STRENGTHS = (0.01, 0.1, 1.0, 4.0)
+STRENGTHS = (0.01, 0.1, 1.0, 4.0, 16.0)
 """Strengths of the scan, in typical values; both signs where the bounds allow.  Each point is followed to where the
 straight line through it and the point without the effect says that the best strength is."""
 
@@ -64,6 +64,9 @@ KEEP = 1
 
 REFIT = 8
 """Extensions of a round that are refitted in closed loop."""
+
+FAR_OFF = 10.0
+"""On a slow plant, extensions whose cost in the scan is so many times the least are not refitted."""
 
 PULLED = 4.0
 """Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are refitted: it may
@@ -414,10 +417,11 @@ class Search:
         self._prior_points = {_point_of(base.fit): point for base, point in zip(bases, points, strict=True)}
         scans = self.each(_scan_in_worker, list(todo.values()), f"{text}: scan")
         order = sorted(zip(todo.values(), scans, strict=True), key=lambda item: item[1][0][0])
+        least = order[0][1][0][0] if order else np.inf
         chosen = [
             (base, name, [s for _, s in starts])
             for k, ((base, name), starts) in enumerate(order)
-            if (k < REFIT or base.pulled) and (not self.slow or self._promising(k, base, starts[0][0], worth))
+            if (k < REFIT or base.pulled) and (not self.slow or self._promising(k, starts[0][0], least, worth))
         ]
         refitted = [self._known(c) for c in self.each(_add_in_worker, chosen, f"{text}: refit")]
         ranked = sorted(refitted, key=lambda c: c.penalised)
@@ -426,9 +430,9 @@ class Search:
         return sorted([*polished, *ranked[len(polished) :]], key=lambda c: c.penalised)
 
     @staticmethod
-    def _promising(rank: int, base: Candidate, scanned: float, worth: float) -> bool:
-        """Whether a refit on a slow plant can be worth its time: by its rank, and half the gain that is asked for."""
-        return rank == 0 or (rank < REFIT and scanned < 0.5 * (base.penalised + worth))
+    def _promising(rank: int, scanned: float, least: float, worth: float) -> bool:
+        """Whether a refit on a slow plant can be worth its time: by its rank, and by what the scan says of it."""
+        return rank == 0 or (rank < REFIT and scanned < worth and scanned <= FAR_OFF * least)
 
     def each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
         """function(search, *item) for every item, wherever the executor works; the same results everywhere.

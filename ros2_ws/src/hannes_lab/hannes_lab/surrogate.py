@@ -89,9 +89,9 @@ class AnchoredRig:
         """See Rig."""
         return self.exact.nuisances(model)
 
-    def own_error(self, block: Block) -> Array:
+    def own_error(self, block: Block, model: Model) -> Array:
         """See Rig."""
-        return self.exact.own_error(block)
+        return self.exact.own_error(block, model)
 
     def effect(self, kind: EffectType) -> EffectType:
         """See Rig."""

@@ -298,7 +298,7 @@ def make_trial(
     cut = len(spans) - len(closures) - (len(inside) - len(whole))
     if cut:
         notes.append(f"{cut} of {len(spans)} closures are cut off and left out")
-    options = {key: meta[key] for key in ("object", "sensors", "pose", "encoder_session") if key in meta}
+    options = {key: meta[key] for key in ("object", "sensors", "plant", "pose", "encoder_session") if key in meta}
     return Trial(
         name,
         period,

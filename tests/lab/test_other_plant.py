@@ -1,0 +1,43 @@
+"""Recordings of one plant, fitted by another: the model is an approximation of what made them, and knows it."""
+
+from __future__ import annotations
+
+import pytest
+from hannes_description.model import Model
+from hannes_lab.diagnose import Diagnosis, diagnose, effect_sources
+from hannes_lab.hide import make_set
+from hannes_lab.prepare import prepare
+from hannes_lab.trials import make_trial
+from hannes_sim.effect import strength_of
+
+FEW = ("viscous_friction", "glove_stiffness", "wire_slack")
+
+
+def diagnosed(*effects: str) -> Diagnosis:
+    """The reduced plant's answer to closures of the full hand."""
+    made, _ = make_set(
+        Model.load("nominal_mujoco"), [strength_of(name, 1.0) for name in effects], seed=23, closures=5
+    )
+    assert {recording.metadata["plant"] for recording in made} == {"mujoco"}
+    prepared = prepare([make_trial(recording) for recording in made], Model.load())
+    assert "wire.stiffness" in [n.name for n in prepared.nuisances]
+    assert prepared.problem.discrepancy
+    return diagnose(prepared, effect_sources(only=FEW), max_effects=1)
+
+
+def test_the_full_hand_lacks_nothing_to_the_reduced_one() -> None:
+    assert diagnosed().verdict == "nothing"
+
+
+def test_an_effect_of_the_full_hand_is_found_by_the_reduced_one() -> None:
+    found = diagnosed("glove_stiffness")
+    assert found.verdict == "effects" and [e.name for e in found.effects] == ["glove_stiffness"]
+    # The full hand's own spring, felt at the pulley, is softer than the reduced one's: the glove makes up for it.
+    assert found.effects[0].parameters["stiffness"].value == pytest.approx(0.002, rel=0.5)
+
+
+def test_to_its_own_plant_a_model_has_no_error_of_its_own() -> None:
+    made, _ = make_set(Model.load(), [], seed=23, closures=5, conditions=("slow",))
+    prepared = prepare([make_trial(recording) for recording in made], Model.load())
+    assert not prepared.problem.discrepancy
+    assert "wire.stiffness" not in [n.name for n in prepared.nuisances]
