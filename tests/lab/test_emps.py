@@ -56,6 +56,7 @@ def test_nothing_of_a_hand_is_offered(prepared: Prepared) -> None:
     assert {
         "coulomb_friction",
         "stribeck_friction",
+        "velocity_strengthening",
         "presliding_friction",
         "cogging",
         "command_delay",
