@@ -31,7 +31,7 @@ from .prepare import Prepared
 from .problem import Problem, build_problem
 from .rig import Rig
 from .screen import usable_effects
-from .search import PENALTY, Candidate, Progress, Search, silent
+from .search import HOPELESS, PENALTY, Candidate, Progress, Search, silent
 from .settle import slopes_at
 from .surrogate import exact_rig
 
@@ -54,9 +54,6 @@ wrong one beyond it in 0.7 % at worst, of sets that are as far apart as that (no
 
 OWN_ERROR_TIE = 12.0
 """The same where the model has an error of its own."""
-
-HOPELESS = 10.0
-"""Sets whose cost is so many times that of the best are not followed."""
 
 RIVAL = 2.0
 """Sets whose cost is at most so many times that of the best are judged beside it with the noise found at it."""

@@ -31,36 +31,37 @@ def usable_effects(prepared: Prepared, sources: Mapping[str, str]) -> Usable:
     acts on another (friction that is smaller at rest, where the model has none) counts where it moves a signal beside
     that other.
     """
-    kept: dict[str, str] = {}
-    silent: dict[str, str] = {}
-    notes: list[str] = []
-    for name, source in sources.items():
-        if name in prepared.rig.without:
-            notes.append(f"{name} is not considered: {prepared.rig.without[name]}")
-        elif _moves(prepared, source):
-            kept[name] = source
-        else:
-            silent[name] = source
-    beside = {n: s for n, s in silent.items() if any(_moves(prepared, s, other) for other in kept.values())}
-    usable = {n: s for n, s in sources.items() if n in kept or n in beside}
-    left_out = [n for n in silent if n not in beside]
-    if left_out:
+    without = prepared.rig.without
+    notes = [f"{name} is not considered: {without[name]}" for name in sources if name in without]
+    offered = {name: source for name, source in sources.items() if name not in without}
+    alone = _moving(prepared, offered)
+    moving = set(alone)
+    for other in (name for name in offered if name in alone):
+        moving |= _moving(prepared, {n: s for n, s in offered.items() if n not in moving}, offered[other])
+    silent = [name for name in offered if name not in moving]
+    if silent:
         notes.append(
-            f"{', '.join(left_out)} would move none of the compared signals on this machine and are not considered"
+            f"{', '.join(silent)} would move none of the compared signals on this machine and are not considered"
         )
-    return Usable(usable, tuple(notes))
+    return Usable({name: source for name, source in offered.items() if name in moving}, tuple(notes))
 
 
-def _moves(prepared: Prepared, source: str, other: str | None = None) -> bool:
-    """Whether an effect that is switched on moves a compared signal, on the model or beside another effect."""
+def _moving(prepared: Prepared, sources: Mapping[str, str], other: str | None = None) -> set[str]:
+    """Names of the effects that move a compared signal when switched on, on the model or beside another effect."""
+    if not sources:
+        return set()
     model, values = prepared.model, dict[str, float]()
     if other is not None:
         model = _with(prepared, model, other)
         values = _switched_on(prepared.rig.effect(load_effect(other)))
     base = prepared.problem.residual(model, values)
-    switched = _switched_on(prepared.rig.effect(load_effect(source)))
-    moved = prepared.problem.residual(_with(prepared, model, source), {**values, **switched}) - base
-    return float(np.linalg.norm(moved)) > MOVES
+    out = set()
+    for name, source in sources.items():
+        switched = _switched_on(prepared.rig.effect(load_effect(source)))
+        moved = prepared.problem.residual(_with(prepared, model, source), {**values, **switched}) - base
+        if float(np.linalg.norm(moved)) > MOVES:
+            out.add(name)
+    return out
 
 
 def _with(prepared: Prepared, model: Model, source: str) -> Model:

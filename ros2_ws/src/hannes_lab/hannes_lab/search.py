@@ -65,8 +65,8 @@ KEEP = 1
 REFIT = 8
 """Extensions of a round that are refitted in closed loop."""
 
-FAR_OFF = 10.0
-"""On a slow plant, extensions whose cost in the scan is so many times the least are not refitted."""
+HOPELESS = 10.0
+"""Sets whose cost is so many times that of the best are not followed; on a slow plant, by the scan already."""
 
 PULLED = 4.0
 """Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are refitted: it may
@@ -432,7 +432,7 @@ class Search:
     @staticmethod
     def _promising(rank: int, scanned: float, least: float, worth: float) -> bool:
         """Whether a refit on a slow plant can be worth its time: by its rank, and by what the scan says of it."""
-        return rank == 0 or (rank < REFIT and scanned < worth and scanned <= FAR_OFF * least)
+        return rank == 0 or (rank < REFIT and scanned < worth and scanned <= HOPELESS * least)
 
     def each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
         """function(search, *item) for every item, wherever the executor works; the same results everywhere.
