@@ -16,6 +16,7 @@ from hannes_lab.search import Search
 from hannes_lab.surrogate import AnchoredRig, repeated, rig_for
 from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import strength_of
+from hannes_sim.plant import PlantDiverged
 
 FULL = Model.load("nominal_mujoco")
 
@@ -115,3 +116,15 @@ def test_an_effect_hidden_in_the_full_hand_is_found_with_its_size():
     # The valley between the glove and the hand's own spring is long: one condition of five closures ends within 15 %.
     assert estimate.value == pytest.approx(true, rel=0.15)
     assert found.falls[-1].held_out < 0.7 * found.falls[1].held_out
+
+
+def test_threads_give_the_same_numbers_and_the_same_errors(trial):
+    wanted = [n for n in HandRig([trial]).nuisances(FULL) if n.name.startswith("friction.")]
+    coordinates = [nuisance_coordinate(n) for n in wanted]
+    assert len(coordinates) == 2
+    one, two = (rig_for(HandRig([trial]), FULL, coordinates, threads) for threads in (1, 2))
+    values = {"friction.viscous": 1.1 * FULL.parameters.value("friction.viscous")}
+    np.testing.assert_array_equal(simulated(one, trial, values), simulated(two, trial, values))
+    bad = replace(coordinates[0], name="hand.stiffness", offset=1e6, upper=np.inf)
+    with pytest.raises(PlantDiverged):
+        two.sloped([bad, bad])

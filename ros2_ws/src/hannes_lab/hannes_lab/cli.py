@@ -132,6 +132,7 @@ def _prepared(
     signals: Sequence[str] | None,
     rig: str | None = None,
     scale: Sequence[str] | None = None,
+    threads: int = 1,
 ) -> Prepared:
     machine = load_rig(rig) if rig else None
     if machine is not None and model == "nominal":
@@ -155,7 +156,7 @@ def _prepared(
     trials = [
         replace(t, options={**t.options, "object": given[t.name]}) if t.name in given else t for t in trials
     ]
-    return prepare(trials, Model.load(model), rig=machine, signals=signals, surrogate=True)
+    return prepare(trials, Model.load(model), rig=machine, signals=signals, surrogate=True, threads=threads)
 
 
 def _factors(scale: Sequence[str] | None) -> dict[str, float]:
@@ -310,7 +311,7 @@ def diagnose(
     json: Json = False,
 ) -> None:
     """Which physical effect does the model lack: nothing, effects of the catalogue, or something unknown?"""
-    prepared = _prepared(bags, model, objects, signals, rig, scale)
+    prepared = _prepared(bags, model, objects, signals, rig, scale, jobs)
     _check_effects(prepared, [*(only or ()), *(effects or ())])
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
         found = diagnose_model(
@@ -413,7 +414,7 @@ def add(
     json: Json = False,
 ) -> None:
     """Add effects to the model, fit them, and show the error fall on held-out data."""
-    prepared = _prepared(bags, model, objects, signals, rig, scale)
+    prepared = _prepared(bags, model, objects, signals, rig, scale, jobs)
     _check_effects(prepared, effects or ())
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
         found = add_effects(
@@ -538,7 +539,7 @@ def report(
     json: Json = False,
 ) -> None:
     """Compare, diagnose and add, all on one self-contained HTML page."""
-    prepared = _prepared(bags, model, objects, signals, rig, scale)
+    prepared = _prepared(bags, model, objects, signals, rig, scale, jobs)
     _check_effects(prepared, effects or ())
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
         found = diagnose_model(

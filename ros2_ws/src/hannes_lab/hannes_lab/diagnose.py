@@ -362,7 +362,8 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         ]
         rivals = [c for c in wide if c.penalised <= RIVAL * round_[0].penalised]
         near = sorted(new.refitted(rivals), key=lambda c: c.penalised)
-        best = new.polish(near[0])
+        # On a slow plant the refit was one with all derivatives afresh.
+        best = near[0] if new.slow else new.polish(near[0])
         limits_new = chance(new.problem, best.fit, new.signatures(best))
         close = tuple(c for c in near[1:] if c.penalised <= best.penalised + _tie(new))
         adequate = _adequate(new, best, limits_new)

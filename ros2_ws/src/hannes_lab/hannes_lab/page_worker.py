@@ -100,9 +100,8 @@ def work(task: Mapping[str, Any], folder: Path, say: Say) -> None:
     progress = _Progress(say)
     say({"kind": "effects", "titles": {name: kind.title for name, kind in catalogue().items()}})
     progress(0, 1, "reading the bags")
-    prepared = _prepared(
-        task["bags"], task["model"], *(task.get(k) for k in ("objects", "signals", "rig", "scale"))
-    )
+    objects, signals, rig, scale = (task.get(k) for k in ("objects", "signals", "rig", "scale"))
+    prepared = _prepared(task["bags"], task["model"], objects, signals, rig, scale, task["jobs"])
     progress(1, 1, "reading the bags")
     notes = list(prepared.notes)
     say({"kind": "data", "data": data_used(prepared.features), "notes": notes, "model": prepared.model.name})

@@ -116,12 +116,14 @@ def prepare(
     rig: Rig | type[PlantRig] | None = None,
     signals: Sequence[str] | None = None,
     surrogate: bool = False,
+    threads: int = 1,
 ) -> Prepared:
     """Estimate noise and scatter at the fitted nominal model.
 
     rig      another machine's rig, or its class; the hand's if None
     signals  which signals take part; all that are there if None
     surrogate  search a slow plant through a fast one (surrogate.py); `rig` of the result is the exact one
+    threads  among which the slow plant's simulations are divided while this process works alone
     """
     trials = [without_outliers(trial) for trial in trials]
     if rig is None:
@@ -138,7 +140,7 @@ def prepare(
     features = build_features(trials, present, rig.points)
     nuisances = tuple(rig.nuisances(model))
     coordinates = [nuisance_coordinate(n) for n in nuisances]
-    view = rig_for(rig, model, coordinates) if surrogate else rig
+    view = rig_for(rig, model, coordinates, threads) if surrogate else rig
     problem = build_problem(view, features, model, nuisances, {})
     found = fit(problem, model, coordinates, {}, evaluations=15)
     settled, found = settle(problem, found)

@@ -29,7 +29,7 @@ from .problem import (
     vanishing_entry,
 )
 from .rig import Nuisance
-from .settle import settle
+from .settle import at_anchor, settle
 from .spectrum import position_periods
 from .surrogate import AnchoredRig, anchored_at
 
@@ -65,8 +65,17 @@ KEEP = 1
 REFIT = 8
 """Extensions of a round that are refitted in closed loop."""
 
+RIVAL_START = 2.0
+"""A second start of a fit is carried on to a slow plant if it costs less than so many times what the first reached."""
+
 HOPELESS = 10.0
 """Sets whose cost is so many times that of the best are not followed; on a slow plant, by the scan already."""
+
+AHEAD = 2
+"""Approaches to a slow plant that are carried on to it first; what they reach tells which others are hopeless."""
+
+REMOVED = 0.3
+"""An approach that removes this part of its base's cost is never called hopeless: the way on may be long."""
 
 PULLED = 4.0
 """Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are refitted: it may
@@ -281,14 +290,19 @@ class Search:
         return self._known(found)
 
     def _add(self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None) -> Candidate:
-        model, coordinates = self.with_effects((*base.names, name))
         if starts is None:
+            model, coordinates = self.with_effects((*base.names, name))
             starts = [start for _, start in self.starts(name, base.fit, model, coordinates, KEEP)]
-        tried = []
+        return self._settled(base, name, starts, self._approaches(base, name, starts))
+
+    def _approaches(self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]]) -> list[Fit]:
+        """Fits of the base set plus one effect from each start, best first; a slow plant runs at their ends only."""
+        model, coordinates = self.with_effects((*base.names, name))
+        found = []
         for start in starts:
             near = self._nearer(start, base.fit)
             known = {c.name: near.jacobian[:, j] for j, c in enumerate(near.coordinates) if c.prior}
-            found = fit(
+            one = fit(
                 self.seen(near),
                 model,
                 coordinates,
@@ -298,17 +312,31 @@ class Search:
                 evaluations=15 if self.slow else 10,
             )
             # Costs that were seen from different places cannot be compared before the anchor is there.
-            tried.append(settle(self.problem, found, self.rows, moves=2, renew=False)[1])
-        best = min(tried, key=lambda f: f.cost)
+            found.append(at_anchor(self.problem, one, self.rows)[1] if self.slow else one)
+        return sorted(found, key=lambda f: f.cost)
+
+    def _settled(
+        self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]], approaches: Sequence[Fit]
+    ) -> Candidate:
+        """The best that the approaches lead to: on a slow plant the first, and others that cost about as little."""
+        best = self._carried_on(approaches[0])
+        for other in approaches[1:]:
+            if other.cost <= RIVAL_START * best.cost:
+                best = min(best, self._carried_on(other), key=lambda f: f.cost)
         if best.cost > base.fit.cost:
             # The set contains the base: the search was led astray, and starts again from where the base is.
             strengths = {f"{name}.{p.name}" for p in self.effect(name).parameters if p.vanishing is not None}
             here = {c.name: float(z) for c, z in zip(base.fit.coordinates, base.fit.z, strict=True)}
             at = {**starts[0], **here, **dict.fromkeys(strengths, 0.0)}
-            again = fit(self.seen(base.fit), model, coordinates, at, rows=self.rows, evaluations=10)
-            again = settle(self.problem, again, self.rows, moves=2, renew=False)[1]
-            best = min(best, again, key=lambda f: f.cost)
+            again = fit(
+                self.seen(base.fit), best.model, best.coordinates, at, rows=self.rows, evaluations=10
+            )
+            best = min(best, self._carried_on(again), key=lambda f: f.cost)
         return _candidate((*base.names, name), best)
+
+    def _carried_on(self, found: Fit) -> Fit:
+        """A fit carried on to the slow plant, in a few moves; on a fast plant it is there."""
+        return settle(self.problem, found, self.rows, moves=2, renew=False)[1]
 
     def _nearer(self, start: Mapping[str, float], base: Fit) -> Fit:
         """Where a fit from a start looks from: the base, or its nominal nuisance parameters if they are nearer.
@@ -421,18 +449,39 @@ class Search:
         chosen = [
             (base, name, [s for _, s in starts])
             for k, ((base, name), starts) in enumerate(order)
-            if (k < REFIT or base.pulled) and (not self.slow or self._promising(k, starts[0][0], least, worth))
+            if (k < REFIT or base.pulled)
+            and (not self.slow or self._promising(k, starts[0][0], least, worth) or k == len(base.names) == 0)
         ]
-        refitted = [self._known(c) for c in self.each(_add_in_worker, chosen, f"{text}: refit")]
+        refitted = [self._known(c) for c in self._refits(chosen, text)]
         ranked = sorted(refitted, key=lambda c: c.penalised)
         worthy = [(c,) for c in ranked[:POLISH] if c.penalised < worth]
+        if self.slow and worthy:
+            # There polishing is long, and tells between sets that are close.
+            close = [(c,) for (c,) in worthy if c.penalised <= HOPELESS * ranked[0].penalised]
+            worthy = close if len(close) > 1 else []
         polished = [self._known(c) for c in self.each(_polish_in_worker, worthy, f"{text}: polish")]
         return sorted([*polished, *ranked[len(polished) :]], key=lambda c: c.penalised)
+
+    def _refits(self, chosen: Sequence[tuple[Candidate, str, list[Any]]], text: str) -> list[Candidate]:
+        """Fits in closed loop; on a slow plant those that the first of them leave hopeless are not carried on to it."""
+        if not self.slow:
+            return self.each(_add_in_worker, chosen, f"{text}: refit")
+        found = self.each(_approach_in_worker, chosen, f"{text}: approach")
+        items = [(*item, fits) for item, fits in zip(chosen, found, strict=True)]
+        items.sort(key=lambda item: item[3][0].cost)
+        done = self.each(_settle_in_worker, items[:AHEAD], f"{text}: refit")
+        least = min((c.fit.cost for c in done), default=np.inf)
+        rest = [
+            item
+            for item in items[AHEAD:]
+            if item[3][0].cost <= max(HOPELESS * least, (1.0 - REMOVED) * item[0].fit.cost)
+        ]
+        return [*done, *self.each(_settle_in_worker, rest, f"{text}: refit")]
 
     @staticmethod
     def _promising(rank: int, scanned: float, least: float, worth: float) -> bool:
         """Whether a refit on a slow plant can be worth its time: by its rank, and by what the scan says of it."""
-        return rank == 0 or (rank < REFIT and scanned < worth and scanned <= HOPELESS * least)
+        return rank < REFIT and scanned < worth and scanned <= HOPELESS * least
 
     def each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
         """function(search, *item) for every item, wherever the executor works; the same results everywhere.
@@ -586,6 +635,18 @@ def _add_in_worker(
     search: Search, base: Candidate, name: str, starts: list[dict[str, float]] | None
 ) -> Candidate:
     return search._add(base, name, starts)
+
+
+def _approach_in_worker(
+    search: Search, base: Candidate, name: str, starts: list[dict[str, float]]
+) -> list[Fit]:
+    return search._approaches(base, name, starts)
+
+
+def _settle_in_worker(
+    search: Search, base: Candidate, name: str, starts: list[dict[str, float]], approaches: list[Fit]
+) -> Candidate:
+    return search._settled(base, name, starts, approaches)
 
 
 def _polish_in_worker(search: Search, candidate: Candidate, evaluations: int = 15) -> Candidate:

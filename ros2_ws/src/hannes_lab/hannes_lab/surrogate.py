@@ -11,6 +11,7 @@ there, so that what is reported at the end was simulated on the slow plant.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from hannes_description.model import Model
 from hannes_sim.effect import EffectType
 from numpy.typing import NDArray
 
+from .executor import own
 from .features import Block, compact_end, has_memory
 from .problem import Coordinate
 from .rig import Nuisance, PlantRig, Rig
@@ -26,6 +28,8 @@ from .trials import Trial
 Array = NDArray[np.float64]
 Anchor = tuple[Any, ...]
 Key = tuple[Any, ...]
+Wanted = tuple[Mapping[str, float], Trial, Array]
+"""A simulation: parameters, trial and reference."""
 
 FAST_PLANT = "reduced"
 SLOW_PLANTS = ("mujoco",)
@@ -42,6 +46,7 @@ class AnchoredRig:
     """A rig whose slow plant is replaced by the fast one, a correction taken at an anchor, and slopes.
 
     exact   the rig itself
+    threads  of which slow simulations that are needed together are divided; a copy in another process has one
     """
 
     def __init__(
@@ -51,8 +56,14 @@ class AnchoredRig:
         values: Mapping[str, float],
         slopes: Mapping[str, _Slope] | None = None,
         corrections: dict[Key, Array] | None = None,
+        threads: int = 1,
+        ends: Mapping[str, int | None] | None = None,
     ) -> None:
         self.exact = exact
+        self.threads = threads
+        # A plant must not be stepped by two threads: each has its own.
+        self._exacts = [exact]
+        self._ends = ends or {trial.name: compact_end(trial) for trial in exact.trials}
         self.trials = exact.trials
         self.floor, self.points, self.pooled = exact.floor, exact.points, exact.pooled
         self.drive_signals, self.without = exact.drive_signals, exact.without
@@ -63,7 +74,8 @@ class AnchoredRig:
         self._corrections: dict[Key, Array] = corrections if corrections is not None else {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return AnchoredRig, (self.exact, self._model, self._values, self._slopes, self._corrections)
+        kept = self._slopes, self._corrections, 1, self._ends
+        return AnchoredRig, (self.exact, self._model, self._values, *kept)
 
     def identity(self) -> tuple[Any, ...]:
         """See PlantRig."""
@@ -71,14 +83,19 @@ class AnchoredRig:
 
     def anchored(self, model: Model, values: Mapping[str, float]) -> AnchoredRig:
         """The same with another anchor; slopes change little along the way and stay."""
-        return AnchoredRig(self.exact, model, values, self._slopes, self._corrections)
+        return self._like(model, values, self._slopes)
 
     def sloped(self, coordinates: Sequence[Coordinate]) -> AnchoredRig:
         """The same with the slow plant's slopes at the anchor for these coordinates."""
-        slopes = dict(self._slopes)
-        for c in coordinates:
-            slopes[c.name] = self._slope(c)
-        return AnchoredRig(self.exact, self._model, self._values, slopes, self._corrections)
+        slopes = dict(zip((c.name for c in coordinates), self._new_slopes(coordinates), strict=True))
+        return self._like(self._model, self._values, {**self._slopes, **slopes})
+
+    def _like(
+        self, model: Model, values: Mapping[str, float], slopes: Mapping[str, _Slope]
+    ) -> AnchoredRig:
+        made = AnchoredRig(self.exact, model, values, slopes, self._corrections, self.threads, self._ends)
+        made._exacts = self._exacts
+        return made
 
     @property
     def slopes(self) -> frozenset[str]:
@@ -115,40 +132,76 @@ class AnchoredRig:
         run = self.exact.simulate(model.with_plant(FAST_PLANT), values, trial, reference)
         return np.array([run[name] for name in trial.signals])
 
-    def _slow(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Array:
-        run = self.exact.simulate(model, values, trial, reference)
-        return np.array([run[name] for name in trial.signals])
+    def _slow(self, wanted: Sequence[Wanted]) -> list[Array]:
+        """Signals (k, ticks) of the slow plant for each (values, trial, reference)."""
+        threads = min(self.threads, len(wanted))
+        while len(self._exacts) < threads:
+            self._exacts.append(own(self.exact))
 
-    def _difference(self, values: Mapping[str, float], trial: Trial, reference: Array) -> Array:
-        """Slow - fast (signals, ticks); the whole trial only where both plants gave it."""
-        slow = self._slow(self._model, values, trial, reference)
-        fast = self._fast(self._model, values, trial, reference)
-        ticks = min(slow.shape[1], fast.shape[1])
-        return slow[:, :ticks] - fast[:, :ticks]
+        def part(number: int) -> list[Array]:
+            out = []
+            for values, trial, reference in wanted[number::threads]:
+                run = self._exacts[number].simulate(self._model, values, trial, reference)
+                out.append(np.array([run[name] for name in trial.signals]))
+            return out
+
+        if threads < 2:
+            return part(0) if wanted else []
+        with ThreadPoolExecutor(threads) as pool:
+            parts = list(pool.map(part, range(threads)))
+        return [parts[k % threads][k // threads] for k in range(len(wanted))]
+
+    def _differences(self, wanted: Sequence[Wanted]) -> list[Array]:
+        """Slow - fast (signals, ticks) for each; the whole trial only where both plants gave it."""
+        out = []
+        for (values, trial, reference), slow in zip(wanted, self._slow(wanted), strict=True):
+            fast = self._fast(self._model, values, trial, reference)
+            ticks = min(slow.shape[1], fast.shape[1])
+            out.append(slow[:, :ticks] - fast[:, :ticks])
+        return out
 
     def _correction(self, trial: Trial, reference: Array, size: int) -> Array:
-        if not has_memory(self._model):
-            reference = reference[: compact_end(trial)]
+        reference = self._shortest(trial, reference)
         key = (self._anchor, trial.name, reference.size)
         if key not in self._corrections:
-            while len(self._corrections) >= KEPT:
-                del self._corrections[next(iter(self._corrections))]
-            self._corrections[key] = self._difference(self._values, trial, reference)
+            self._learn(trial, reference)
         return repeated(self._corrections[key], trial, size)
 
-    def _slope(self, c: Coordinate) -> _Slope:
-        _, _, where = c.name.partition("@")
-        here = c.z(self._values[c.name]) if c.name in self._values else 0.0
-        step = c.inside_step(here)
-        moved = {**self._values, c.name: c.value(here + step)}
-        signals = {}
-        for trial in self.trials:
-            if where in ("", trial.name):
-                reference = trial.reference[: compact_end(trial)]
-                change = self._difference(moved, trial, reference)
-                change = change[:, : reference.size] - self._correction(trial, reference, reference.size)
-                signals[trial.name] = change / step
-        return _Slope(c, signals)
+    def _shortest(self, trial: Trial, reference: Array) -> Array:
+        return reference if has_memory(self._model) else reference[: self._ends[trial.name]]
+
+    def _learn(self, trial: Trial, reference: Array) -> None:
+        """Take the correction of a trial, and those of the others: they are wanted next."""
+        ends = [(other, self._shortest(other, other.reference)) for other in self.trials if other is not trial]
+        wanted = [
+            (self._values, one, ticks)
+            for one, ticks in [(trial, reference), *ends]
+            if (self._anchor, one.name, ticks.size) not in self._corrections
+        ]
+        for (_, one, ticks), found in zip(wanted, self._differences(wanted), strict=True):
+            while len(self._corrections) >= KEPT:
+                del self._corrections[next(iter(self._corrections))]
+            self._corrections[self._anchor, one.name, ticks.size] = found
+
+    def _new_slopes(self, coordinates: Sequence[Coordinate]) -> list[_Slope]:
+        wanted: list[Wanted] = []
+        whose: list[tuple[int, float]] = []
+        for number, c in enumerate(coordinates):
+            _, _, where = c.name.partition("@")
+            here = c.z(self._values[c.name]) if c.name in self._values else 0.0
+            step = c.inside_step(here)
+            moved = {**self._values, c.name: c.value(here + step)}
+            for trial in self.trials:
+                if where in ("", trial.name):
+                    wanted.append((moved, trial, trial.reference[: self._ends[trial.name]]))
+                    whose.append((number, step))
+        signals: list[dict[str, Array]] = [{} for _ in coordinates]
+        for (_, trial, reference), change, (number, step) in zip(
+            wanted, self._differences(wanted), whose, strict=True
+        ):
+            n = reference.size
+            signals[number][trial.name] = (change[:, :n] - self._correction(trial, reference, n)) / step
+        return [_Slope(c, own) for c, own in zip(coordinates, signals, strict=True)]
 
 
 class _Slope:
@@ -183,14 +236,14 @@ def repeated(known: Array, trial: Trial, size: int) -> Array:
     return known[:, np.minimum(index, known.shape[1] - 1)]
 
 
-def rig_for(rig: Rig, model: Model, coordinates: Sequence[Coordinate]) -> Rig:
+def rig_for(rig: Rig, model: Model, coordinates: Sequence[Coordinate], threads: int = 1) -> Rig:
     """The rig to search with: the rig itself, or anchored at the nominal values where the model's plant is slow.
 
     The slow plant's slopes are taken there along the coordinates that are known well: near to their nominal values is
     where the truth is expected.  Across a wide prior a slope at its middle would lead astray.
     """
     if model.plant in SLOW_PLANTS and isinstance(rig, PlantRig):
-        return AnchoredRig(rig, model, {}).sloped([c for c in coordinates if c.step >= KNOWN_WELL])
+        return AnchoredRig(rig, model, {}, threads=threads).sloped([c for c in coordinates if c.step >= KNOWN_WELL])
     return rig
 
 

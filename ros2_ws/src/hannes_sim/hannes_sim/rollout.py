@@ -49,7 +49,7 @@ class Controller(Protocol):
     def reset(self) -> None: ...
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _closed_loop(advance, handle, reading, control, cx, cp, cs, reference, period, substeps, out, voltages):  # type: ignore[no-untyped-def]
     cx_at, cp_at, cs_at, handle_at = cx.ctypes.data, cp.ctypes.data, cs.ctypes.data, handle.ctypes.data
     n = reference.shape[0]
