@@ -79,8 +79,7 @@ def test_a_hidden_effect_is_named_its_parameter_recovered_and_the_error_falls(
 def test_friction_within_reach_of_the_tolerance_is_no_effect_but_is_pointed_at() -> None:
     """0.0125 N.m more is little over three standard deviations of the hand's own friction: a reader must see it."""
     prepared, _ = data(["coulomb_friction"], seed=3004, factor=1.25)
-    only = effect_sources(only=["coulomb_friction", "viscous_friction", "gravity"])
-    found = diagnose(prepared, only)
+    found = diagnose(prepared, effect_sources(model=prepared.model), max_effects=1)
     assert found.verdict == "nothing"
     assert found.nuisances["friction.coulomb"]["prior_sds"] > 3.0
     assert "But it takes friction.coulomb" in found.summary
@@ -176,3 +175,20 @@ def test_json_has_the_promised_keys() -> None:
     assert set(content["error"]) >= {"nominal", "final", "repeatability", "held_out"}
     assert set(content["effects"][0]["parameters"]["stiffness"]) >= {"value", "low", "high", "unit"}
     assert set(content["falls"][0]) >= {"added", "train", "held_out"}
+
+
+def test_a_glove_is_told_from_the_hands_own_spring_as_far_as_the_tolerance_of_that_says():
+    """Both act on the same coordinate: only the prior of the spring parts them, and the interval must say so."""
+    weak = strength_of("glove_stiffness", 0.15)
+    recordings, truth = make_set(Model.load(), [weak], seed=812)
+    prepared = prepare([make_trial(r) for r in recordings], Model.load())
+    found = diagnose(prepared, effect_sources(only=["glove_stiffness"]), max_effects=1)
+    stiffness = found.effects[0].parameters["stiffness"]
+    sd = next(n.sd for n in prepared.nuisances if n.name == "hand.stiffness")
+    width = (stiffness.high - stiffness.low) / (2 * 1.96)
+    assert stiffness.low > 0.0 and 0.7 * sd < width < 1.3 * sd
+    assert abs(stiffness.value - weak.values["stiffness"]) < 3.0 * sd
+    spring = float(truth.parameters["hand.stiffness"].removeprefix("x "))
+    total = spring * prepared.model.parameters.value("hand.stiffness") + weak.values["stiffness"]
+    here = found.values["hand.stiffness"] + found.values["glove_stiffness.stiffness"]
+    assert here == pytest.approx(total, rel=0.02)

@@ -79,6 +79,7 @@ def add_effects(
     for k, name in enumerate(sources):
         progress(k, len(sources), f"fit with {name}")
         best = search.polish(search.add(best, name))
+    best = search.with_spread(best)
     limits = chance(prepared.problem, search.null().fit, {})
     falls = error_falls(prepared, search, best)
     return Addition(

@@ -256,11 +256,11 @@ def diagnose(
     nothing = not best.names and adequate
     verdict = "nothing" if nothing else "effects" if adequate or (greedy and best.names) else "unknown"
     tied = _ties(choice) if verdict == "effects" else ()
-    model = fitted_model(prepared.model, search, best) if best.names else prepared.model
     falls = error_falls(prepared, search, best, in_order=greedy)
     if verdict == "unknown":
         best, falls = _worth_showing(search, best, falls)
-        model = fitted_model(prepared.model, search, best) if best.names else prepared.model
+    best = search.with_spread(best)
+    model = fitted_model(prepared.model, search, best) if best.names else prepared.model
     effects = found_effects(search, best, limits, falls)
     experiments = (
         separating_experiments(prepared, search, [search.found[tuple(sorted(n))] for n in tied])

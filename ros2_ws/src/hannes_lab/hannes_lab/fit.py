@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from hannes_description.model import Model
@@ -54,6 +54,23 @@ class Fit:
         return np.asarray(np.linalg.pinv(self.jacobian.T @ self.jacobian + prior) * inflate, dtype=np.float64)
 
 
+ROUGHNESS = 20.0
+"""Least change of the whitened prediction (root of the sum of squares) by which a derivative along a strength is taken.
+A simulation with dry friction is rough: a change by next to nothing already moves the prediction by about 1."""
+
+WIDEST = 1.0
+WIDEST_LOG = 10.0
+"""Longest step of a derivative: along a strength in typical values, and for the logarithm of a shape in usual steps."""
+
+
+def smooth_step(c: Coordinate, z: float, derivative: Array) -> float:
+    """Step along a coordinate with this derivative, long enough for the simulation's roughness if it is a strength."""
+    usual = abs(c.inside_step(z))
+    if c.prior or c.log:
+        return usual
+    return max(usual, min(ROUGHNESS / max(float(np.linalg.norm(derivative)), 1e-12), WIDEST))
+
+
 def finite_differences(
     problem: Problem,
     model: Model,
@@ -61,16 +78,68 @@ def finite_differences(
     z: Array,
     residual: Array,
     columns: Sequence[int],
+    steps: dict[str, float] | None = None,
 ) -> Array:
-    """Derivatives (size, len(columns)) of the whitened residual, one simulation each; steps stay inside the bounds."""
+    """Derivatives (size, len(columns)) of the whitened residual, one simulation each; steps stay inside the bounds.
+
+    steps   step by coordinate name, the coordinate's own if it is not there; a longer one is put in where the change
+            was too small for the simulation's roughness
+    """
     out = np.empty((residual.size, len(columns)))
+    steps = {} if steps is None else steps
     values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
+
+    def derivative(c: Coordinate, here: float) -> tuple[Array, float]:
+        step = c.inside_step(here, steps.get(c.name))
+        moved = problem.residual(model, {**values, c.name: c.value(here + step)})
+        return (moved - residual) / step, abs(step)
+
     for k, j in enumerate(columns):
-        c = coordinates[j]
-        step = c.inside_step(float(z[j]))
-        moved = problem.residual(model, {**values, c.name: c.value(float(z[j] + step))})
-        out[:, k] = (moved - residual) / step
+        c, here = coordinates[j], float(z[j])
+        out[:, k], step = derivative(c, here)
+        longer = smooth_step(c, here, out[:, k])
+        if longer > 2.0 * step:
+            failures, short = problem.failures, out[:, k].copy()
+            steps[c.name] = longer
+            out[:, k], _ = derivative(c, here)
+            if problem.failures > failures:
+                steps[c.name], out[:, k] = step, short
     return out
+
+
+def spread(found: Fit) -> dict[str, float]:
+    """Step of the derivative by each coordinate: its standard deviation, but at least the usual step.
+
+    In the derivative by a small step, the simulation's roughness looks like a difference between parameters that act
+    alike (a glove's stiffness and the hand's own): fits stop half way along the valley between them, and intervals come
+    out too narrow.
+    """
+    out = {}
+    for j, (c, z, sd) in enumerate(
+        zip(found.coordinates, found.z, np.sqrt(np.diag(found.covariance())), strict=True)
+    ):
+        usual = abs(c.inside_step(float(z)))
+        most = 1.0 if c.prior else WIDEST_LOG * usual if c.log else WIDEST
+        out[c.name] = max(min(float(sd), most), smooth_step(c, float(z), found.jacobian[:, j]))
+    return out
+
+
+def over_its_spread(problem: Problem, found: Fit) -> Fit:
+    """The fit with each derivative as the secant over the parameter's own standard deviation, for the covariance.
+
+    The standard deviation depends on the derivatives, so they are taken twice.
+    """
+    for _ in range(2):
+        jacobian, steps = found.jacobian.copy(), spread(found)
+        for j, c in enumerate(found.coordinates):
+            z, (low, high) = float(found.z[j]), c.bounds
+            ends = max(z - steps[c.name], low), min(z + steps[c.name], high)
+            failures = problem.failures
+            there = [problem.residual(found.model, {**found.values, c.name: c.value(end)}) for end in ends]
+            if problem.failures == failures and ends[1] > ends[0]:
+                jacobian[:, j] = (there[1] - there[0]) / (ends[1] - ends[0])
+        found = replace(found, jacobian=jacobian)
+    return found
 
 
 def fit(
@@ -81,6 +150,7 @@ def fit(
     *,
     rows: Mask | None = None,
     known: Mapping[str, Array] | None = None,
+    steps: Mapping[str, float] | None = None,
     evaluations: int = 12,
 ) -> Fit:
     """Least squares over z from `start` (z by name, others 0).
@@ -88,6 +158,7 @@ def fit(
     rows         features that take part; None: all
     known        derivatives (size,) by coordinate name that are taken as constant (those of nuisance parameters hardly
                  change); the others are found by finite differences at every step
+    steps        of the finite differences, see there
     evaluations  limit on the steps of the trust-region search (scipy's trf)
     """
     coordinates = tuple(coordinates)
@@ -113,6 +184,7 @@ def fit(
         return cache[key]
 
     last: dict[str, Array] = {}
+    steps = dict(steps or {})
 
     def jacobian_at(z: Array) -> Array:
         r = residual_at(z)
@@ -123,7 +195,7 @@ def fit(
                 full[:, j] = known[c.name]
             else:
                 todo.append(j)
-        full[:, todo] = finite_differences(problem, model, coordinates, z, r, todo)
+        full[:, todo] = finite_differences(problem, model, coordinates, z, r, todo, steps)
         last["jacobian"] = full
         last["z"] = z.copy()
         return full

@@ -72,10 +72,11 @@ class Coordinate:
             else (value - self.offset) / self.scale
         )
 
-    def inside_step(self, z: float) -> float:
-        """Step of a finite difference at z that stays inside the bounds."""
+    def inside_step(self, z: float, wanted: float | None = None) -> float:
+        """Step of a finite difference at z that stays inside the bounds; of the usual length, or as wanted."""
         low, high = self.bounds
-        step = self.step if self.prior or self.log else self.step * max(abs(z), SMALLEST_STRENGTH)
+        usual = self.step if self.prior or self.log else self.step * max(abs(z), SMALLEST_STRENGTH)
+        step = usual if wanted is None else wanted
         if z + step > high:
             step = -step
         if z + step < low:

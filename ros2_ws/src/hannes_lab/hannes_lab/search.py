@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .cache import Codec, NotPlain, Store, code_hash, content_hash
 from .errors import SignalError
 from .executor import Executor, Held, own
-from .fit import Fit, finite_differences, fit
+from .fit import Fit, finite_differences, fit, over_its_spread, spread
 from .problem import (
     Coordinate,
     Counts,
@@ -29,7 +29,7 @@ from .problem import (
     vanishing_entry,
 )
 from .rig import Nuisance
-from .settle import at_anchor, settle
+from .settle import at_anchor, settle, slopes_at
 from .spectrum import position_periods
 from .surrogate import AnchoredRig, anchored_at
 
@@ -341,10 +341,8 @@ class Search:
     def _nearer(self, start: Mapping[str, float], base: Fit) -> Fit:
         """Where a fit from a start looks from: the base, or its nominal nuisance parameters if they are nearer.
 
-        A fast plant looks the same from everywhere.
+        A slow plant is anchored there, and the derivatives by the nuisance parameters are those of that point.
         """
-        if not self.slow:
-            return base
         z = np.array([start.get(c.name, 0.0) for c in base.coordinates if c.prior])
         there = np.array([v for c, v in zip(base.coordinates, base.z, strict=True) if c.prior])
         return self.prior_point(base) if z @ z < (z - there) @ (z - there) else base
@@ -385,9 +383,24 @@ class Search:
     def _again(self, old: Fit, evaluations: int) -> Fit:
         """A fit from where another ended, carried on to the slow plant itself where there is one."""
         found = fit(
-            self.seen(old), old.model, old.coordinates, old.z, rows=self.rows, evaluations=evaluations
+            self.seen(old),
+            old.model,
+            old.coordinates,
+            old.z,
+            rows=self.rows,
+            steps=spread(old),
+            evaluations=evaluations,
         )
         return settle(self.problem, found, self.rows)[1]
+
+    def with_spread(self, candidate: Candidate) -> Candidate:
+        """The candidate with the derivatives from which its intervals are made."""
+        found: Candidate = self.once(_spread_in_worker, candidate, text="intervals")
+        return self._known(found)
+
+    def _with_spread(self, candidate: Candidate) -> Candidate:
+        problem = self.problem.with_rig(slopes_at(self.problem.rig, candidate.fit))
+        return replace(candidate, fit=over_its_spread(problem, candidate.fit))
 
     def renewed(self, best: Candidate) -> Search:
         """The same search with noise and scatter estimated at another point: sensitivities there are the true ones."""
@@ -405,10 +418,10 @@ class Search:
 
     def without(self, larger: Candidate, names: Names) -> Candidate:
         """A part of a set, fitted again from where the larger one ended, or its known fit if that costs less."""
-        start = {c.name: float(z) for c, z in zip(larger.fit.coordinates, larger.fit.z, strict=True)}
         model, coordinates = self.with_effects(names)
-        z = np.array([start[c.name] for c in coordinates])
-        there = replace(larger.fit, model=model, coordinates=coordinates, z=z)
+        index = [[c.name for c in larger.fit.coordinates].index(c.name) for c in coordinates]
+        z, jacobian = larger.fit.z[index], larger.fit.jacobian[:, index]
+        there = replace(larger.fit, model=model, coordinates=coordinates, z=z, jacobian=jacobian)
         again: Candidate = self.once(_refit_in_worker, Candidate(names, there, np.inf), 15, text="without it")
         known = self.found.get(tuple(sorted(names)))
         return known if known is not None and known.fit.cost <= again.fit.cost else self._known(again)
@@ -620,6 +633,10 @@ def _prior_in_worker(search: Search, base: Candidate) -> Fit:
 
 def _signature_in_worker(search: Search, base: Candidate, name: str) -> list[Array]:
     return search._signature(base, name)
+
+
+def _spread_in_worker(search: Search, candidate: Candidate) -> Candidate:
+    return search._with_spread(candidate)
 
 
 def _refit_in_worker(search: Search, candidate: Candidate, evaluations: int) -> Candidate:

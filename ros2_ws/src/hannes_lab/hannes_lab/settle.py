@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .fit import Fit, fit
+from .fit import Fit, fit, spread
 from .problem import Problem
 from .rig import Rig
 from .surrogate import AnchoredRig, anchored_at
@@ -51,7 +51,9 @@ def settle(
     problem = _sloped(problem, best, anew=False)
     renewed = not renew
     for _ in range(moves):
-        new = fit(problem, best.model, best.coordinates, best.z, rows=rows, evaluations=15)
+        new = fit(
+            problem, best.model, best.coordinates, best.z, rows=rows, steps=spread(best), evaluations=15
+        )
         least = max(SETTLED, LITTLE * best.cost)
         if best.cost - new.cost < least:
             break

@@ -4,9 +4,9 @@
     wire        tension = k max(0, q - ql - slack) + b (q' - ql'), never negative
     load side   J_h ql'' = tension - return(ql) - stops(ql) - object(ql) - friction(ql')
 
-return(ql) = preload + stiffness ql; the object is a spring and damper that pushes back only.  Dry friction is solved
-implicitly (it sticks exactly), the rest semi-implicitly.  A wire of zero stiffness switches the load side off: a single
-mass with a motor, which is what many single-drive machines are.
+return(ql) = preload + stiffness ql; the object is a spring and damper that pushes back only.  Dry friction (which sticks
+exactly) and the damping of hand and object are solved implicitly, the rest semi-implicitly.  A wire of zero stiffness
+switches the load side off: a single mass with a motor, which is what many single-drive machines are.
 
 Limits: no single fingers, no gravity along the motion, constant moment arms; the MuJoCo plant has these.
 Source of the structure: thesis section 4, "at the pulley"; of the friction form: dry_friction in motor.py.
@@ -127,20 +127,23 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
             if stretch > 0.0:
                 stiffness = 1.0 / (1.0 / p[_WIRE_K] + max(0.0, y[COMPLIANCE]))
                 load = max(0.0, stiffness * stretch + p[_WIRE_B] * (v - vl))
-            depth = ql - p[_OBJECT_AT]
-            contact = 0.0
-            if depth > 0.0:
-                contact = max(0.0, p[_OBJECT_K] * depth + (p[_OBJECT_B] + y[OBJECT_DAMPING]) * vl)
-            force = load - p[_PRELOAD] - p[_STIFFNESS] * ql - contact + y[LOAD_TORQUE]
+            force = load - p[_PRELOAD] - p[_STIFFNESS] * ql + y[LOAD_TORQUE]
             if ql < 0.0:
                 force -= p[_STOP_K] * ql
             elif ql > p[_TRAVEL]:
                 force -= p[_STOP_K] * (ql - p[_TRAVEL])
-            damping = p[_LOAD_VISCOUS] + y[LOAD_DAMPING]
-            inertia = p[_J_LOAD] + dt * damping
-            vl = dry_friction(
-                (p[_J_LOAD] * vl + dt * force) / inertia, p[_LOAD_COULOMB] + y[LOAD_FRICTION], inertia, dt
-            )
+            inertia = p[_J_LOAD] + dt * (p[_LOAD_VISCOUS] + y[LOAD_DAMPING])
+            momentum, friction = p[_J_LOAD] * vl + dt * force, p[_LOAD_COULOMB] + y[LOAD_FRICTION]
+            vl = dry_friction(momentum / inertia, friction, inertia, dt)
+            depth, contact = ql - p[_OBJECT_AT], 0.0
+            if depth > 0.0:
+                # It pushes back, or lets go: which of the two is known once its damping is solved with the velocity.
+                spring, damper = p[_OBJECT_K] * depth, p[_OBJECT_B] + y[OBJECT_DAMPING]
+                pressed = inertia + dt * damper
+                against = dry_friction((momentum - dt * spring) / pressed, friction, pressed, dt)
+                contact = max(0.0, spring + damper * against)
+                if contact > 0.0:
+                    vl = against
             ql += dt * vl
         else:
             ql, vl, load = q, v, 0.0

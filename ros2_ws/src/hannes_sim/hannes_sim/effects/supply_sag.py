@@ -3,14 +3,14 @@
 from typing import Any
 
 from ..effect import Effect, EffectParameter
-from ..ports import CURRENT, SUPPLY, VOLTAGE, VOLTAGE_DROP
+from ..ports import RESISTANCE, RESISTANCE_REL, SUPPLY, VOLTAGE
 
 
 class SupplySag(Effect):
     """Inner resistance of the battery and its leads, seen through the duty cycle.
 
     Equation: supply = V - R_s i d with duty d = u / V (the bridge draws i d from the battery), so u_motor = u -
-    R_s i d^2.
+    R_s i d^2: a resistance R_s d^2 in series with the motor's.
     Limits: no capacity or recovery effects; the logged voltage is duty x nominal supply and does not show the sag.
     """
 
@@ -23,4 +23,4 @@ class SupplySag(Effect):
     @staticmethod
     def contribute(x: Any, p: Any, s: Any, y: Any) -> None:
         duty = x[VOLTAGE] / x[SUPPLY]
-        y[VOLTAGE_DROP] += p[0] * x[CURRENT] * duty * duty
+        y[RESISTANCE_REL] += p[0] * duty * duty / x[RESISTANCE]
