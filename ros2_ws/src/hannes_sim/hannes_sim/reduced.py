@@ -4,7 +4,7 @@
     wire        tension = k max(0, q - ql - slack) + b (q' - ql'), never negative
     load side   J_h ql'' = tension - return(ql) - stops(ql) - object(ql) - friction(ql')
 
-return(ql) = preload + stiffness ql; the object is a spring and damper that pushes back only.  Dry friction (which sticks
+return(ql) = preload + stiffness ql; the object is a spring and damper that pushes back only.  Dry friction (it sticks
 exactly) and the damping of hand and object are solved implicitly, the rest semi-implicitly.  A wire of zero stiffness
 switches the load side off: a single mass with a motor, which is what many single-drive machines are.
 
