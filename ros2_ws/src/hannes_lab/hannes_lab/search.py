@@ -301,18 +301,17 @@ class Search:
         found = []
         for start in starts:
             near = self._nearer(start, base.fit)
-            known = {c.name: near.jacobian[:, j] for j, c in enumerate(near.coordinates) if c.prior}
-            one = fit(
-                self.seen(near),
-                model,
-                coordinates,
-                self._true_start(base.fit, model, coordinates, start),
-                rows=self.rows,
-                known={} if self.slow else known,
-                evaluations=15 if self.slow else 10,
-            )
-            # Costs that were seen from different places cannot be compared before the anchor is there.
-            found.append(at_anchor(self.problem, one, self.rows)[1] if self.slow else one)
+            at = self._true_start(base.fit, model, coordinates, start)
+            if self.slow:
+                one = fit(self.seen(near), model, coordinates, at, rows=self.rows, evaluations=15)
+                # Costs that were seen from different places cannot be compared before the anchor is there.
+                found.append(at_anchor(self.problem, one, self.rows)[1])
+                continue
+            for point in (near,) if near is base.fit else (near, base.fit):
+                known = {c.name: point.jacobian[:, j] for j, c in enumerate(point.coordinates) if c.prior}
+                found.append(
+                    fit(self.problem, model, coordinates, at, rows=self.rows, known=known, evaluations=10)
+                )
         return sorted(found, key=lambda f: f.cost)
 
     def _settled(
@@ -341,7 +340,8 @@ class Search:
     def _nearer(self, start: Mapping[str, float], base: Fit) -> Fit:
         """Where a fit from a start looks from: the base, or its nominal nuisance parameters if they are nearer.
 
-        A slow plant is anchored there, and the derivatives by the nuisance parameters are those of that point.
+        A slow plant is anchored there; on a fast one the derivatives by the nuisance parameters are tried from there
+        too, since those of a base that a strong effect drove far off lead nowhere.
         """
         z = np.array([start.get(c.name, 0.0) for c in base.coordinates if c.prior])
         there = np.array([v for c, v in zip(base.coordinates, base.z, strict=True) if c.prior])
