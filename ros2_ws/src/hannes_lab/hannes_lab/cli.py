@@ -236,7 +236,7 @@ def compare(
     json: Json = False,
 ) -> None:
     """Compare the model with recorded closures: where does it fail, and by how much?"""
-    prepared = _prepared(bags, model, objects, signals, rig, scale)
+    prepared = _prepared(bags, model, objects, signals, rig, scale, _JOBS)
     result = compare_model(prepared, fitted=fitted)
     if report:
         _write_report(report, comparison=result, after=None, diagnosis=None)
