@@ -481,6 +481,12 @@ class Search:
             return self.each(_add_in_worker, chosen, f"{text}: refit")
         found = self.each(_approach_in_worker, chosen, f"{text}: approach")
         items = [(*item, fits) for item, fits in zip(chosen, found, strict=True)]
+        # A further effect that gains nothing where its fit ends is near to where it would settle.
+        items = [
+            item
+            for item in items
+            if not item[0].names or _candidate(item[0].names, item[3][0]).penalised < item[0].penalised
+        ]
         items.sort(key=lambda item: item[3][0].cost)
         done = self.each(_settle_in_worker, items[:AHEAD], f"{text}: refit")
         least = min((c.fit.cost for c in done), default=np.inf)
