@@ -462,8 +462,11 @@ class Search:
         chosen = [
             (base, name, [s for _, s in starts])
             for k, ((base, name), starts) in enumerate(order)
-            if (k < REFIT or base.pulled)
-            and (not self.slow or self._promising(k, starts[0][0], least, worth) or k == len(base.names) == 0)
+            if (
+                self._promising(k, starts[0][0], least, worth) or (k == 0 and not base.names)
+                if self.slow
+                else k < REFIT or base.pulled
+            )
         ]
         refitted = [self._known(c) for c in self._refits(chosen, text)]
         ranked = sorted(refitted, key=lambda c: c.penalised)

@@ -172,10 +172,12 @@ class AnchoredRig:
 
     def _learn(self, trial: Trial, reference: Array) -> None:
         """Take the correction of a trial, and those of the others: they are wanted next."""
-        ends = [(other, self._shortest(other, other.reference)) for other in self.trials if other is not trial]
+        others = [t for t in self.trials if t.name != trial.name]
+        ends = [(other, self._shortest(other, other.reference)) for other in others]
+        # The one that is wanted now comes last: what is too much to keep makes way from the oldest on.
         wanted = [
             (self._values, one, ticks)
-            for one, ticks in [(trial, reference), *ends]
+            for one, ticks in [*ends, (trial, reference)]
             if (self._anchor, one.name, ticks.size) not in self._corrections
         ]
         for (_, one, ticks), found in zip(wanted, self._differences(wanted), strict=True):
@@ -201,7 +203,7 @@ class AnchoredRig:
         ):
             n = reference.size
             signals[number][trial.name] = (change[:, :n] - self._correction(trial, reference, n)) / step
-        return [_Slope(c, own) for c, own in zip(coordinates, signals, strict=True)]
+        return [_Slope(c, by_trial) for c, by_trial in zip(coordinates, signals, strict=True)]
 
 
 class _Slope:
