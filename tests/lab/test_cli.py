@@ -104,6 +104,7 @@ def test_hide_keeps_the_truth_away_from_the_bags(
         (("compare", "no/such/bag"), "does not exist"),
         (("diagnose", "BAGS", "--effect", "wire_slak"), "Unknown effect"),
         (("diagnose", "BAGS", "--model", "nothing"), "No model"),
+        (("diagnose", "BAGS", "--dask", "foo"), "tcp://HOST:8786"),
         (("add", "BAGS", "--effect", "mine.py:Mine"), "No file"),
         (("compare", "BAGS", "--object", "slow"), "CONDITION="),
         (("compare", "BAGS", "--object", "quick=soft"), "unknown conditions"),

@@ -9,9 +9,10 @@ from hannes_lab.add import add_effects
 from hannes_lab.chance import chance
 from hannes_lab.compare import compare
 from hannes_lab.diagnose import Diagnosis, _Choice, _pruned, diagnose, effect_sources
+from hannes_lab.fit import Fit, fit
 from hannes_lab.hide import Truth, make_set
 from hannes_lab.prepare import Prepared, prepare
-from hannes_lab.search import Search
+from hannes_lab.search import Candidate, Search
 from hannes_lab.trials import make_trial
 from hannes_sim.effect import load_effect, strength_of
 
@@ -101,6 +102,25 @@ def test_an_effect_that_a_later_one_made_superfluous_is_dropped() -> None:
     assert kept.best.penalised < both.penalised + limits.gain
 
 
+def test_a_fit_from_which_nothing_of_worth_is_in_reach_ends_early_and_is_not_kept() -> None:
+    prepared, _ = data(["glove_stiffness"], seed=102)
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, {})
+    start = {c.name: 1.0 for c in search.coordinates}
+
+    def tried(worth: float) -> tuple[Fit, int]:
+        before = prepared.problem.simulations
+        found = fit(prepared.problem, prepared.model, search.coordinates, start, worth=worth)
+        return found, prepared.problem.simulations - before
+
+    whole, simulations = tried(np.inf)
+    same, as_many = tried(1.1 * whole.cost)
+    assert whole.complete and same.complete and (same.cost, as_many) == (whole.cost, simulations)
+    ended, fewer = tried(0.5 * whole.cost)
+    assert not ended.complete and fewer < simulations and ended.cost >= whole.cost
+    assert search._known(Candidate((), ended, ended.cost)).fit is ended
+    assert search.null().fit.cost <= whole.cost, "a fit that ended early must not stand for the set"
+
+
 def test_one_closure_is_said_to_hold_nothing_out() -> None:
     model = Model.load()
     recordings, _ = make_set(model, [], seed=104, closures=1, conditions=("fast",))
@@ -108,8 +128,7 @@ def test_one_closure_is_said_to_hold_nothing_out() -> None:
     assert "nan" not in found.summary and "one closure of each condition only" in found.summary
 
 
-@pytest.mark.timeout(1200)  # the longest search: every round is tried before the answer is "unknown"
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(600)  # the longest search: every round is tried before the answer is "unknown"
 def test_an_effect_outside_the_catalogue_is_called_unknown(tmp_path: Path) -> None:
     file = tmp_path / "latch.py"
     file.write_text(OUTSIDE)

@@ -296,7 +296,7 @@ class Codec:
             if model.sha256 != result.model.sha256 or tuple(coordinates) != tuple(result.coordinates):
                 raise NotPlain("a fit of another model")
             own = {"z": result.z, "cost": float(result.cost)}
-            own |= {"residual": result.residual, "jacobian": result.jacobian}
+            own |= {"residual": result.residual, "jacobian": result.jacobian, "complete": result.complete}
             return {"kind": "Fit", "names": list(names), **own}
         if type(result).__name__ in self._kinds:
             own = {f.name: self.pack(getattr(result, f.name)) for f in fields(result)}
@@ -312,7 +312,7 @@ class Codec:
         kind = content["kind"]
         if kind == "Fit":
             model, coordinates = self._rebuild(tuple(content["names"]))
-            numbers = (content[name] for name in ("z", "cost", "residual", "jacobian"))
+            numbers = (content[name] for name in ("z", "cost", "residual", "jacobian", "complete"))
             return Fit(model, tuple(coordinates), *numbers)
         if kind == "tuple":
             return tuple(self.unpack(one) for one in content["items"])

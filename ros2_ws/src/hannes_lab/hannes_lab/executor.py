@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import re
 import signal
 import sys
 import threading
@@ -31,6 +32,9 @@ P = ParamSpec("P")
 Work = Callable[..., Any]
 """(shared, key of shared, function, item) -> (result, simulations, failures)"""
 
+ADDRESS = re.compile(r"((tcp|tls|wss?|ucxx?)://)?[^/\s]+:\d+|inproc://\S+")
+"""What a Dask client takes as an address; with others it prints a traceback of its own."""
+
 CONNECT_S = 10
 """Seconds in which a Dask scheduler must answer, and have a worker."""
 
@@ -52,6 +56,8 @@ class Executor:
     def __post_init__(self) -> None:
         if self.jobs < 1:
             raise HannesError(f"{self.jobs} jobs: at least one process is needed.")
+        if self.dask is not None and not ADDRESS.fullmatch(self.dask):
+            raise HannesError(f"'{self.dask}' is no address of a Dask scheduler; give it as tcp://HOST:8786.")
 
     @property
     def serial(self) -> bool:

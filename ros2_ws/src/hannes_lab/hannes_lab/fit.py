@@ -24,6 +24,7 @@ class Fit:
     cost        sum of squares of whitened residual and prior
     residual    (size,) whitened residual of all features, also of those that were held out
     jacobian    (size, k) derivative of the residual by z
+    complete    False where the search ended early since nothing of worth was in reach
     """
 
     model: Model
@@ -32,6 +33,7 @@ class Fit:
     cost: float
     residual: Array
     jacobian: Array
+    complete: bool = True
 
     @property
     def values(self) -> dict[str, float]:
@@ -142,6 +144,22 @@ def over_its_spread(problem: Problem, found: Fit) -> Fit:
     return found
 
 
+PATIENCE = 3.0
+"""A search that is not worth it ends where so many more falls like the last one, of what it promises, would not do."""
+
+
+class _NotWorth(Exception):
+    """A search that leads to no cost that is worth its time."""
+
+
+def linear_minimum(jacobian: Array, residual: Array, z: Array, prior: Array) -> tuple[float, Array]:
+    """Least cost along the straight lines (jacobian (n, k) at z (k,)) with the priors (k,), and where it is (k,)."""
+    weight = np.diag(np.maximum(prior, 1e-9))
+    step = -np.linalg.solve(jacobian.T @ jacobian + weight, jacobian.T @ residual + prior * z)
+    left, there = residual + jacobian @ step, z + step
+    return float(left @ left + (prior * there) @ (prior * there)), there
+
+
 def fit(
     problem: Problem,
     model: Model,
@@ -152,6 +170,7 @@ def fit(
     known: Mapping[str, Array] | None = None,
     steps: Mapping[str, float] | None = None,
     evaluations: int = 12,
+    worth: float = np.inf,
 ) -> Fit:
     """Least squares over z from `start` (z by name, others 0).
 
@@ -160,6 +179,8 @@ def fit(
                  change); the others are found by finite differences at every step
     steps        of the finite differences, see there
     evaluations  limit on the steps of the trust-region search (scipy's trf)
+    worth        a search ends early where the straight lines lead to no cost below this, have little left to gain, and
+                 promise much the same as a step ago
     """
     coordinates = tuple(coordinates)
     known = known or {}
@@ -200,23 +221,41 @@ def fit(
         last["z"] = z.copy()
         return full
 
+    def cost(r: Array, z: Array) -> float:
+        return float(r @ r + (priors * z) @ (priors * z))
+
+    promised: list[float] = []
+
+    def search_direction(z: Array) -> Array:
+        jacobian, r = jacobian_at(z)[use], residual_at(z)[use]
+        if worth < np.inf:
+            promised.append(linear_minimum(jacobian, r, z, priors)[0])
+            short = promised[-1] - worth
+            to_gain = cost(r, z) - promised[-1]
+            if len(promised) > 1 and short > max(to_gain, PATIENCE * abs(promised[-2] - promised[-1])):
+                raise _NotWorth
+        return np.vstack([jacobian, np.diag(priors)])
+
     if not coordinates:
         r = problem.residual(model, {})
         return Fit(model, (), np.zeros(0), float(r[use] @ r[use]), r, np.zeros((r.size, 0)))
     inside = np.clip(z0, bounds[0] + 1e-9, bounds[1] - 1e-9)
-    found = least_squares(
-        lambda z: np.concatenate([residual_at(z)[use], priors * z]),
-        inside,
-        jac=lambda z: np.vstack([jacobian_at(z)[use], np.diag(priors)]),
-        bounds=(bounds[0], bounds[1]),
-        method="trf",
-        max_nfev=evaluations,
-        ftol=1e-5,
-        xtol=1e-5,
-        gtol=1e-8,
-        x_scale=1.0,
-    )
-    z = found.x
+    complete = True
+    try:
+        z = least_squares(
+            lambda z: np.concatenate([residual_at(z)[use], priors * z]),
+            inside,
+            jac=search_direction,
+            bounds=(bounds[0], bounds[1]),
+            method="trf",
+            max_nfev=evaluations,
+            ftol=1e-5,
+            xtol=1e-5,
+            gtol=1e-8,
+            x_scale=1.0,
+        ).x
+    except _NotWorth:
+        z, complete = last["z"], False
     r = residual_at(z)
     jacobian = last["jacobian"] if "z" in last and np.allclose(last["z"], z, atol=0.2) else jacobian_at(z)
-    return Fit(model, coordinates, z, float(r[use] @ r[use] + (priors * z) @ (priors * z)), r, jacobian)
+    return Fit(model, coordinates, z, cost(r[use], z), r, jacobian, complete)

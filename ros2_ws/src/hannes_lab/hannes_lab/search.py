@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .cache import Codec, NotPlain, Store, code_hash, content_hash
 from .errors import SignalError
 from .executor import Executor, Held, own
-from .fit import Fit, finite_differences, fit, over_its_spread, spread
+from .fit import Fit, finite_differences, fit, linear_minimum, over_its_spread, spread
 from .problem import (
     Coordinate,
     Counts,
@@ -56,7 +56,7 @@ class Candidate:
     @property
     def pulled(self) -> bool:
         """True where a nuisance parameter is far from its nominal value."""
-        return any(c.prior and abs(z) > PULLED for c, z in zip(self.fit.coordinates, self.fit.z, strict=True))
+        return _off(self.fit) > PULLED
 
 
 KEEP = 1
@@ -80,6 +80,9 @@ REMOVED = 0.3
 PULLED = 4.0
 """Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are refitted: it may
 have taken over an effect, which a scan does not see."""
+
+NEAR = 2.0
+"""A base whose nuisance parameters are all within so many standard deviations is scanned from where it is alone."""
 
 POLISH = 3
 """Extensions of a round that are refitted with all derivatives afresh."""
@@ -174,7 +177,7 @@ class Search:
         # The amplitudes of one wave, or the halves of a difference, are right together only.
         joint = list(itertools.product(*shapes)) if len(strengths) > 1 else []
         scored: list[list[tuple[float, dict[str, float]]]] = []
-        for point in (base, self.prior_point(base)):
+        for point in (base, self.prior_point(base)) if _off(base) > NEAR else (base,):
             here = {c.name: float(z) for c, z in zip(point.coordinates, point.z, strict=True)}
             problem = self.seen(point)
 
@@ -264,13 +267,9 @@ class Search:
     def compensated(self, residual: Array, base: Fit) -> tuple[float, Array]:
         """Cost of a residual after the linear best move of the base fit's coordinates, and where they move to."""
         use = slice(None) if self.rows is None else self.rows
-        jacobian = base.jacobian[use]
         prior = np.array([1.0 if c.prior else 0.0 for c in base.coordinates])
-        a = jacobian.T @ jacobian + np.diag(np.maximum(prior, 1e-9))
-        r = residual[use]
-        step = -np.linalg.solve(a, jacobian.T @ r + prior * base.z)
-        moved, z = r + jacobian @ step, base.z + step
-        return float(moved @ moved + (prior * z) @ (prior * z)), self._inside(z, base)
+        cost, z = linear_minimum(base.jacobian[use], residual[use], base.z, prior)
+        return cost, self._inside(z, base)
 
     @staticmethod
     def _inside(z: Array, base: Fit) -> Array:
@@ -286,18 +285,26 @@ class Search:
         self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None = None
     ) -> Candidate:
         """Fit the base set plus one effect, from the best points of the scan (or the given ones)."""
-        found: Candidate = self.once(_add_in_worker, base, name, starts, text=f"fit with {name}")
+        found: Candidate = self.once(_add_in_worker, base, name, starts, np.inf, text=f"fit with {name}")
         return self._known(found)
 
-    def _add(self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None) -> Candidate:
+    def _add(
+        self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None, worth: float
+    ) -> Candidate:
         if starts is None:
             model, coordinates = self.with_effects((*base.names, name))
             starts = [start for _, start in self.starts(name, base.fit, model, coordinates, KEEP)]
-        return self._settled(base, name, starts, self._approaches(base, name, starts))
+        return self._settled(base, name, starts, self._approaches(base, name, starts, worth), worth)
 
-    def _approaches(self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]]) -> list[Fit]:
-        """Fits of the base set plus one effect from each start, best first; a slow plant runs at their ends only."""
+    def _approaches(
+        self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]], worth: float = np.inf
+    ) -> list[Fit]:
+        """Fits of the base set plus one effect from each start, best first; a slow plant runs at their ends only.
+
+        worth   penalised cost below which the set is of interest
+        """
         model, coordinates = self.with_effects((*base.names, name))
+        worth -= _penalty(coordinates)
         found = []
         for start in starts:
             near = self._nearer(start, base.fit)
@@ -308,14 +315,28 @@ class Search:
                 found.append(at_anchor(self.problem, one, self.rows)[1])
                 continue
             for point in (near,) if near is base.fit else (near, base.fit):
-                known = {c.name: point.jacobian[:, j] for j, c in enumerate(point.coordinates) if c.prior}
+                known = _derivatives(point, [c for c in point.coordinates if c.prior])
                 found.append(
-                    fit(self.problem, model, coordinates, at, rows=self.rows, known=known, evaluations=10)
+                    fit(
+                        self.problem,
+                        model,
+                        coordinates,
+                        at,
+                        rows=self.rows,
+                        known=known,
+                        evaluations=10,
+                        worth=worth,
+                    )
                 )
         return sorted(found, key=lambda f: f.cost)
 
     def _settled(
-        self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]], approaches: Sequence[Fit]
+        self,
+        base: Candidate,
+        name: str,
+        starts: Sequence[Mapping[str, float]],
+        approaches: Sequence[Fit],
+        worth: float = np.inf,
     ) -> Candidate:
         """The best that the approaches lead to: on a slow plant the first, and others that cost about as little."""
         best = self._carried_on(approaches[0])
@@ -328,7 +349,14 @@ class Search:
             here = {c.name: float(z) for c, z in zip(base.fit.coordinates, base.fit.z, strict=True)}
             at = {**starts[0], **here, **dict.fromkeys(strengths, 0.0)}
             again = fit(
-                self.seen(base.fit), best.model, best.coordinates, at, rows=self.rows, evaluations=10
+                self.seen(base.fit),
+                best.model,
+                best.coordinates,
+                at,
+                rows=self.rows,
+                known={} if self.slow else _derivatives(base.fit),
+                evaluations=10,
+                worth=worth - _penalty(best.coordinates),
             )
             best = min(best, self._carried_on(again), key=lambda f: f.cost)
         return _candidate((*base.names, name), best)
@@ -365,7 +393,8 @@ class Search:
         return start if costs[0] <= costs[1] else kept
 
     def _known(self, candidate: Candidate) -> Candidate:
-        self.found[tuple(sorted(candidate.names))] = candidate
+        if candidate.fit.complete:
+            self.found[tuple(sorted(candidate.names))] = candidate
         return candidate
 
     def polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
@@ -468,7 +497,7 @@ class Search:
                 else k < REFIT or base.pulled
             )
         ]
-        refitted = [self._known(c) for c in self._refits(chosen, text)]
+        refitted = [self._known(c) for c in self._refits(chosen, text, worth)]
         ranked = sorted(refitted, key=lambda c: c.penalised)
         worthy = [(c,) for c in ranked[:POLISH] if c.penalised < worth]
         if self.slow and worthy:
@@ -478,10 +507,12 @@ class Search:
         polished = [self._known(c) for c in self.each(_polish_in_worker, worthy, f"{text}: polish")]
         return sorted([*polished, *ranked[len(polished) :]], key=lambda c: c.penalised)
 
-    def _refits(self, chosen: Sequence[tuple[Candidate, str, list[Any]]], text: str) -> list[Candidate]:
+    def _refits(
+        self, chosen: Sequence[tuple[Candidate, str, list[Any]]], text: str, worth: float
+    ) -> list[Candidate]:
         """Fits in closed loop; on a slow plant those that the first of them leave hopeless are not carried on to it."""
         if not self.slow:
-            return self.each(_add_in_worker, chosen, f"{text}: refit")
+            return self.each(_add_in_worker, [(*item, worth) for item in chosen], f"{text}: refit")
         found = self.each(_approach_in_worker, chosen, f"{text}: approach")
         items = [(*item, fits) for item, fits in zip(chosen, found, strict=True)]
         # A further effect that gains nothing where its fit ends is near to where it would settle.
@@ -624,7 +655,23 @@ def _work(
 
 def _candidate(names: Names, found: Fit) -> Candidate:
     """A fitted set with what its free parameters cost."""
-    return Candidate(names, found, found.cost + PENALTY * sum(not c.prior for c in found.coordinates))
+    return Candidate(names, found, found.cost + _penalty(found.coordinates))
+
+
+def _penalty(coordinates: Sequence[Coordinate]) -> float:
+    return PENALTY * sum(not c.prior for c in coordinates)
+
+
+def _off(found: Fit) -> float:
+    """How many standard deviations the nuisance parameters are from their nominal values at most."""
+    return max(
+        (abs(float(z)) for c, z in zip(found.coordinates, found.z, strict=True) if c.prior), default=0.0
+    )
+
+
+def _derivatives(found: Fit, of: Sequence[Coordinate] | None = None) -> dict[str, Array]:
+    """Derivatives (size,) at a fit by coordinate name; of all its coordinates if not of some."""
+    return {c.name: found.jacobian[:, j] for j, c in enumerate(found.coordinates) if of is None or c in of}
 
 
 def _point_of(base: Fit) -> tuple[Names, bytes]:
@@ -658,9 +705,9 @@ def _scan_in_worker(search: Search, base: Candidate, name: str) -> list[tuple[fl
 
 
 def _add_in_worker(
-    search: Search, base: Candidate, name: str, starts: list[dict[str, float]] | None
+    search: Search, base: Candidate, name: str, starts: list[dict[str, float]] | None, worth: float
 ) -> Candidate:
-    return search._add(base, name, starts)
+    return search._add(base, name, starts, worth)
 
 
 def _approach_in_worker(
