@@ -4,6 +4,8 @@ Hands of `bench/other_hand.py`, perturbed and scattering from closure to closure
 without metadata: nothing says how they were logged, what was grasped, or which gains the controller has.  Each set is
 diagnosed with the nominal model.  Every result is kept in a file named by its content and the sources' hash, so
 that an interrupted run goes on where it stopped.  `--tuning` takes other seeds and strengths, for setting thresholds.
+`--full-hand` takes closures of the full hand in MuJoCo instead, without what describes them: a third simulator to the
+reduced plant, on which no threshold was set.
 """
 
 from __future__ import annotations
@@ -15,14 +17,17 @@ import math
 import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.hide import make_set
 from hannes_lab.prepare import load_trials, prepare
+from hannes_lab.trials import Trial, make_trial
+from hannes_sim.effect import strength_of
 from joblib import Parallel, delayed
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -93,6 +98,17 @@ CLEAN: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = (
 """Nothing is hidden, but the hand, its controller or the simulator's friction law is another."""
 
 
+FULL_HAND: tuple[tuple[str, ...], ...] = (
+    (), ("glove_stiffness",), ("viscous_friction",), ("wire_slack",), ("load_dependent_friction",), ("cogging",),
+    ("glove_stiffness", "viscous_friction"), (),
+)  # fmt: skip
+"""What is hidden in the full hand, at the catalogue's typical strength."""
+
+FULL_LOG = "full hand, 30 Hz rectified"
+DESCRIBES = ("sensors", "plant")
+"""What says how a recording was made."""
+
+
 @dataclass(frozen=True)
 class Case:
     """One set of recordings: slow and fast closures on nothing, slow ones on an object."""
@@ -109,6 +125,11 @@ class Case:
         here = Path(__file__).parent
         sources = [source_hash(), *((here / f).read_text() for f in ("foreign.py", "other_hand.py"))]
         return hashlib.sha256(json.dumps([asdict(self), sources]).encode()).hexdigest()[:20]
+
+
+def full_hand_cases() -> list[Case]:
+    """The sets of the full hand."""
+    return [Case(hidden, FULL_LOG, (), 900 + k) for k, hidden in enumerate(FULL_HAND)]
 
 
 def cases(tuning: bool) -> list[Case]:
@@ -197,14 +218,26 @@ def _write(
             writer.write(to[which], stamp + 1_000_000, STORE.serialize_cdr(message, message.__msgtype__))
 
 
-def run_case(case: Case) -> dict[str, Any]:
-    """Record, diagnose with the nominal model, compare with the truth."""
+def trials_of(case: Case) -> list[Trial]:
+    """The set, as it is read."""
+    if case.log == FULL_LOG:
+        hidden = [strength_of(name, 1.0) for name in case.hidden]
+        recordings, _ = make_set(Model.load("nominal_mujoco"), hidden, seed=case.seed, closures=case.repeats)
+        trials = [make_trial(r) for r in recordings]
+        return [
+            replace(t, options={k: v for k, v in t.options.items() if k not in DESCRIBES}) for t in trials
+        ]
     with tempfile.TemporaryDirectory() as folder:
         record(case, Path(folder))
-        start = time.monotonic()
-        model = Model.load()
-        prepared = prepare(load_trials([Path(folder)]), model)
-        found = diagnose(prepared, effect_sources(model=model))
+        return load_trials([Path(folder)])
+
+
+def run_case(case: Case) -> dict[str, Any]:
+    """Record, diagnose with the nominal model, compare with the truth."""
+    trials = trials_of(case)
+    start = time.monotonic()
+    model = Model.load()
+    found = diagnose(prepare(trials, model), effect_sources(model=model))
     return {
         "hidden": sorted(case.hidden),
         "log": case.log,
@@ -232,10 +265,11 @@ def main() -> int:
     )
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--tuning", action="store_true", help="other seeds and strengths")
+    parser.add_argument("--full-hand", action="store_true", help="closures of the full hand, undescribed")
     parser.add_argument("--out", type=Path, default=Path("out/foreign"), help="folder of the kept results")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    todo = cases(options.tuning)
+    todo = full_hand_cases() if options.full_hand else cases(options.tuning)
     runs = Parallel(n_jobs=options.jobs, return_as="generator")(
         delayed(kept)(run_case, c, options.out / f"{c.key}.json") for c in todo
     )
@@ -260,7 +294,8 @@ def main() -> int:
         ("two hidden: both", [r for r in results if len(r["hidden"]) == 2]),
         ("in no catalogue: unknown", [r for r in results if r["hidden"] and r["hidden"][0] in OUTSIDE]),
     ):
-        print(f"{label:<40} {sum(map(as_hidden, part))} of {len(part)}")
+        if part:
+            print(f"{label:<40} {sum(map(as_hidden, part))} of {len(part)}")
     return 0
 
 

@@ -84,6 +84,7 @@ def test_friction_within_reach_of_the_tolerance_is_no_effect_but_is_pointed_at()
     assert found.verdict == "nothing"
     assert found.nuisances["friction.coulomb"]["prior_sds"] > 3.0
     assert "But it takes friction.coulomb" in found.summary
+    assert f"comes nearest is {found.ranking[0].names[0]}" in found.summary and "are asked for" in found.summary
 
 
 def test_an_effect_that_a_later_one_made_superfluous_is_dropped() -> None:

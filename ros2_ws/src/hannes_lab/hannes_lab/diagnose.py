@@ -269,7 +269,7 @@ def diagnose(
     )
     return Diagnosis(
         verdict=verdict,
-        summary=_summary(verdict, effects, tied, falls, limits, best),
+        summary=_summary(verdict, effects, tied, falls, limits, best, _nearest(choice)),
         effects=effects,
         tied=tied,
         experiments=experiments,
@@ -641,6 +641,19 @@ def _moved_far(best: Candidate) -> str:
     )
 
 
+def _nearest(choice: _Choice) -> str:
+    """A sentence on the effect that would gain most where nothing is missing, and on what it would have to gain."""
+    if choice.best.names or not choice.ranking:
+        return ""
+    first = choice.ranking[0]
+    gain = choice.best.penalised + PENALTY - first.cost
+    asked = _needed(choice, choice.best, first=True)
+    return (
+        f" The effect that comes nearest is {' + '.join(first.names)}: it lowers the misfit by {max(gain, 0.0):.0f}, "
+        f"and {asked:.0f} are asked for."
+    )
+
+
 def fall_sentence(falls: Sequence[Fall]) -> str:
     """How the error on held-out closures falls; says so where there is one closure only."""
     before, after = falls[1].held_out, falls[-1].held_out
@@ -659,8 +672,10 @@ def _summary(
     falls: Sequence[Fall],
     limits: Chance,
     best: Candidate,
+    nearest: str,
 ) -> str:
     fall = fall_sentence(falls)
+    far = _moved_far(best)
     if verdict == "nothing":
         return (
             f"Nothing is missing: with its own parameters fitted, the model's misfit {best.fit.cost:.0f} is below what "
@@ -670,7 +685,7 @@ def _summary(
                 if np.isfinite(falls[-1].held_out)
                 else NO_REPEATS
             )
-            + _moved_far(best)
+            + (far and far + nearest)
         )
     names = " and ".join(e.title for e in effects)
     if verdict == "effects":
@@ -678,7 +693,7 @@ def _summary(
         if len(tied) > 1:
             others = "; ".join(" + ".join(names_) for names_ in tied[1:])
             tie = f" With these data it ties with: {others}."
-        return f"Missing: {names}. {fall}{tie}{_moved_far(best)}"
+        return f"Missing: {names}. {fall}{tie}{far}"
     part = f" The catalogue comes nearest with {names}, which is not enough." if names else ""
     return (
         f"Something is missing that is not in the catalogue: the best model's misfit {best.fit.cost:.0f} stays above "
