@@ -84,7 +84,9 @@ def test_friction_within_reach_of_the_tolerance_is_no_effect_but_is_pointed_at()
     assert found.verdict == "nothing"
     assert found.nuisances["friction.coulomb"]["prior_sds"] > 3.0
     assert "But it takes friction.coulomb" in found.summary
-    assert f"comes nearest is {found.ranking[0].names[0]}" in found.summary and "are asked for" in found.summary
+    assert (
+        f"comes nearest is {found.ranking[0].names[0]}" in found.summary and "are asked for" in found.summary
+    )
 
 
 def test_an_effect_that_a_later_one_made_superfluous_is_dropped() -> None:
@@ -120,6 +122,21 @@ def test_a_fit_from_which_nothing_of_worth_is_in_reach_ends_early_and_is_not_kep
     assert not ended.complete and fewer < simulations and ended.cost >= whole.cost
     assert search._known(Candidate((), ended, ended.cost)).fit is ended
     assert search.null().fit.cost <= whole.cost, "a fit that ended early must not stand for the set"
+
+
+def test_a_friction_that_makes_the_hand_stick_is_fitted() -> None:
+    """The misfit has a narrow pit at the true level: a coarse scan, or its linear moves, end beside it."""
+    prepared, truth = data(["joint_friction"], seed=50067, factor=1.94)
+    search = Search(
+        prepared.problem, prepared.model, prepared.nuisances, effect_sources(only=["joint_friction"])
+    )
+    null = search.null()
+    assert null.pulled
+    found = search.add(null, "joint_friction")
+    assert found.fit.cost < 0.05 * null.fit.cost
+    assert found.fit.values["joint_friction.level"] == pytest.approx(
+        truth.effects[0].values["level"], rel=0.1
+    )
 
 
 def test_one_closure_is_said_to_hold_nothing_out() -> None:

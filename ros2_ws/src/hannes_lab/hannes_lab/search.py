@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -58,6 +59,10 @@ class Candidate:
         """True where a nuisance parameter is far from its nominal value."""
         return _off(self.fit) > PULLED
 
+
+FINER = 2
+"""Halvings of the scan's factors beside its best point, where that removes much of the cost: a hand that sticks fits in
+a narrow range of strengths only."""
 
 KEEP = 1
 """Points of each scan (from the base fit, and from the nominal values) from which an effect is refitted."""
@@ -205,6 +210,13 @@ class Search:
                         follow.append((cost, {**start, strength: best}))
             for _, start in sorted(follow, key=lambda item: item[0])[:FOLLOW]:
                 scores.append(score(start, at(start)))
+            for _ in range(FINER if len(strengths) == 1 else 0):
+                least, lowest = min(scores, key=lambda item: item[0])
+                if least > (1.0 - REMOVED) * base.cost:
+                    break
+                alone = {parameter: lowest[parameter] for parameter in own}
+                for start in _between(alone, [s for _, s in scores], strengths[0][0][0]):
+                    scores.append(score(start, at(start)))
             for shape in joint:
                 start = self._joint_start(point, dict(shape), own, model, coordinates)
                 scores.append(score(start, at(start)))
@@ -314,14 +326,20 @@ class Search:
                 # Costs that were seen from different places cannot be compared before the anchor is there.
                 found.append(at_anchor(self.problem, one, self.rows)[1])
                 continue
-            for point in (near,) if near is base.fit else (near, base.fit):
+            ways = [(near, at)]
+            if near is not base.fit:
+                # Where the effect makes the hand stick, the linear moves of the scan lead astray, and so may either
+                # point's derivatives.
+                still = {c.name: at.get(c.name, 0.0) for c in coordinates if not c.prior}
+                ways += [(base.fit, at), (near, still)]
+            for point, begin in ways:
                 known = _derivatives(point, [c for c in point.coordinates if c.prior])
                 found.append(
                     fit(
                         self.problem,
                         model,
                         coordinates,
-                        at,
+                        begin,
                         rows=self.rows,
                         known=known,
                         evaluations=10,
@@ -660,6 +678,19 @@ def _candidate(names: Names, found: Fit) -> Candidate:
 
 def _penalty(coordinates: Sequence[Coordinate]) -> float:
     return PENALTY * sum(not c.prior for c in coordinates)
+
+
+def _between(
+    best: Mapping[str, float], others: Sequence[Mapping[str, float]], strength: str
+) -> list[dict[str, float]]:
+    """Starts half way (in logarithms) from the best one's strength to the next ones of the same sign."""
+    z = best[strength]
+    sizes = [abs(o[strength]) for o in others if o[strength] * z > 0.0]
+    nearest = (
+        max((v for v in sizes if v < 0.99 * abs(z)), default=None),
+        min((v for v in sizes if v > 1.01 * abs(z)), default=None),
+    )
+    return [{**best, strength: math.copysign(math.sqrt(abs(z) * v), z)} for v in nearest if v is not None]
 
 
 def _off(found: Fit) -> float:
