@@ -60,9 +60,10 @@ class Candidate:
         return _off(self.fit) > PULLED
 
 
-FINER = 2
-"""Halvings of the scan's factors beside its best point, where that removes much of the cost: a hand that sticks fits in
-a narrow range of strengths only."""
+FINE = tuple(0.5 * 1.2**k for k in range(16))
+STRAY = 2.0
+"""Strengths that are scanned too where the others leave so many times more squares than there are samples: a hand that
+sticks fits in a narrow range of strengths only, which lies anywhere between theirs."""
 
 KEEP = 1
 """Points of each scan (from the base fit, and from the nominal values) from which an effect is refitted."""
@@ -182,7 +183,8 @@ class Search:
         # The amplitudes of one wave, or the halves of a difference, are right together only.
         joint = list(itertools.product(*shapes)) if len(strengths) > 1 else []
         scored: list[list[tuple[float, dict[str, float]]]] = []
-        for point in (base, self.prior_point(base)) if _off(base) > NEAR else (base,):
+        places = (base, self.prior_point(base)) if _off(base) > NEAR else (base,)
+        for point in places:
             here = {c.name: float(z) for c, z in zip(point.coordinates, point.z, strict=True)}
             problem = self.seen(point)
 
@@ -210,12 +212,12 @@ class Search:
                         follow.append((cost, {**start, strength: best}))
             for _, start in sorted(follow, key=lambda item: item[0])[:FOLLOW]:
                 scores.append(score(start, at(start)))
-            for _ in range(FINER if len(strengths) == 1 else 0):
-                least, lowest = min(scores, key=lambda item: item[0])
-                if least > (1.0 - REMOVED) * base.cost:
-                    break
-                alone = {parameter: lowest[parameter] for parameter in own}
-                for start in _between(alone, [s for _, s in scores], strengths[0][0][0]):
+            left, lowest = min(scores, key=lambda item: item[0])
+            if point is places[-1] and len(strengths) == 1 and left > STRAY * point.residual.size:
+                strength = strengths[0][0][0]
+                sign, (low, high) = math.copysign(1.0, lowest[strength]), own[strength].bounds
+                for z in (sign * size for size in FINE if low <= sign * size <= high):
+                    start = {**{parameter: lowest[parameter] for parameter in own}, strength: z}
                     scores.append(score(start, at(start)))
             for shape in joint:
                 start = self._joint_start(point, dict(shape), own, model, coordinates)
@@ -678,19 +680,6 @@ def _candidate(names: Names, found: Fit) -> Candidate:
 
 def _penalty(coordinates: Sequence[Coordinate]) -> float:
     return PENALTY * sum(not c.prior for c in coordinates)
-
-
-def _between(
-    best: Mapping[str, float], others: Sequence[Mapping[str, float]], strength: str
-) -> list[dict[str, float]]:
-    """Starts half way (in logarithms) from the best one's strength to the next ones of the same sign."""
-    z = best[strength]
-    sizes = [abs(o[strength]) for o in others if o[strength] * z > 0.0]
-    nearest = (
-        max((v for v in sizes if v < 0.99 * abs(z)), default=None),
-        min((v for v in sizes if v > 1.01 * abs(z)), default=None),
-    )
-    return [{**best, strength: math.copysign(math.sqrt(abs(z) * v), z)} for v in nearest if v is not None]
 
 
 def _off(found: Fit) -> float:
