@@ -155,7 +155,7 @@ class _NotWorth(Exception):
 def linear_minimum(jacobian: Array, residual: Array, z: Array, prior: Array) -> tuple[float, Array]:
     """Least cost along the straight lines (jacobian (n, k) at z (k,)) with the priors (k,), and where it is (k,)."""
     weight = np.diag(np.maximum(prior, 1e-9))
-    step = -np.linalg.solve(jacobian.T @ jacobian + weight, jacobian.T @ residual + prior * z)
+    step = -np.linalg.lstsq(jacobian.T @ jacobian + weight, jacobian.T @ residual + prior * z, rcond=None)[0]
     left, there = residual + jacobian @ step, z + step
     return float(left @ left + (prior * there) @ (prior * there)), there
 

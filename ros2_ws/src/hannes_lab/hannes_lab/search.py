@@ -254,12 +254,13 @@ class Search:
         """Least cost along one more direction, with the base fit's coordinates compensating, and how far along it."""
         use = slice(None) if self.rows is None else self.rows
         prior = np.array([1.0 if c.prior else 0.0 for c in base.coordinates])
-        j = np.column_stack([base.jacobian[use], derivative[use]])
-        weight = np.diag([*np.maximum(prior, 1e-9), 0.0])
-        r = base.residual[use]
-        step = -np.linalg.lstsq(j.T @ j + weight, j.T @ r + np.append(prior * base.z, 0.0), rcond=None)[0]
-        moved, z = r + j @ step, base.z + step[:-1]
-        return float(moved @ moved + (prior * z) @ (prior * z)), float(step[-1])
+        cost, z = linear_minimum(
+            np.column_stack([base.jacobian[use], derivative[use]]),
+            base.residual[use],
+            np.append(base.z, 0.0),
+            np.append(prior, 0.0),
+        )
+        return cost, float(z[-1])
 
     def prior_point(self, base: Fit) -> Fit:
         """The base's effects with the nuisance parameters back at their nominal values.
