@@ -71,6 +71,11 @@ class NodeProcess:
                 self.process.wait()
 
 
+def kept_waiting(before: Mapping[str, str], after: Mapping[str, str], period: float = 0.001) -> float:
+    """Time (s) between two reports of a node in which a busy machine did not let its loop run."""
+    return (int(after["missed_cycles"]) - int(before["missed_cycles"])) * period
+
+
 def _text(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
@@ -94,8 +99,8 @@ class Peer:
 
     def __init__(self, context: Context, namespace: str = "hannes") -> None:
         self.node = Node("peer", context=context, namespace=namespace, use_global_arguments=False)
-        self._executor = SingleThreadedExecutor(context=context)
-        self._executor.add_node(self.node)
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.node)
         self.heard: dict[str, list[bytes]] = {}
         self.diagnostics: list[Any] = []
         self._publishers: dict[str, Any] = {}
@@ -122,12 +127,12 @@ class Peer:
         end = monotonic() + timeout
         while not condition():
             assert monotonic() < end, f"not within {timeout} s: {what or condition}"
-            self._executor.spin_once(timeout_sec=0.05)
+            self.executor.spin_once(timeout_sec=0.05)
 
     def spin(self, seconds: float) -> None:
         end = monotonic() + seconds
         while monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.02)
+            self.executor.spin_once(timeout_sec=0.02)
 
     def matched(self, name: str, count: int = 1) -> None:
         """Wait until the signal's publisher here has that many subscribers."""
@@ -149,5 +154,5 @@ class Peer:
         return self.status(node)
 
     def close(self) -> None:
-        self._executor.shutdown()
+        self.executor.shutdown()
         self.node.destroy_node()
