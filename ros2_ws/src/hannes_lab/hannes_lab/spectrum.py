@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import gamma
+from scipy.special import gammainccinv, gammaincinv
 
 from .fit import Fit
 from .problem import Problem
@@ -61,7 +61,7 @@ def position_periods(
         power += float(np.ptp(x)) * _periodogram(x, r, frequency) * (frequency < 1.0 / (2.2 * step))
     # The powers of white noise in n conditions are exponentials; their sum is a gamma variable.
     n = sum(spans.values()) ** 2 / sum(s * s for s in spans.values())
-    stands_out = float(gamma.isf(CHANCE / frequency.size, n) / gamma.median(n))
+    stands_out = float(gammainccinv(n, CHANCE / frequency.size) / gammaincinv(n, 0.5))
     ratio = np.array(
         [
             power[k] / max(float(np.median(power[max(0, k - SURROUNDINGS) : k + SURROUNDINGS + 1])), 1e-300)
