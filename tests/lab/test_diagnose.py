@@ -124,6 +124,21 @@ def test_a_fit_from_which_nothing_of_worth_is_in_reach_ends_early_and_is_not_kep
     assert search.null().fit.cost <= whole.cost, "a fit that ended early must not stand for the set"
 
 
+def test_of_many_extensions_the_best_after_a_few_steps_are_fitted_to_the_end(monkeypatch) -> None:
+    monkeypatch.setattr("hannes_lab.search.REFIT", 1)
+    monkeypatch.setattr("hannes_lab.search.POLISH", 1)
+    prepared, _ = data(["glove_stiffness"], seed=102)
+    names = ["gravity", "glove_stiffness", "viscous_friction"]
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, effect_sources(only=names))
+    null = search.null()
+    assert null.pulled
+    ranked = search.extend([null], names, "one effect")
+    assert [c.fit.complete for c in ranked] == [True, False, False]
+    assert ranked[0].names == ("glove_stiffness",) and set(search.found) == {(), ("glove_stiffness",)}
+    alone = search.polish(search.add(null, "glove_stiffness"))
+    assert ranked[0].fit.cost == pytest.approx(alone.fit.cost, rel=0.01)
+
+
 def test_a_friction_that_makes_the_hand_stick_is_fitted() -> None:
     """The misfit has a narrow pit at the true level: a coarse scan, or its linear moves, end beside it."""
     prepared, truth = data(["joint_friction"], seed=50067, factor=1.94)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from hannes_description.model import Model
-from hannes_lab.diagnose import Diagnosis, diagnose, effect_sources
+from hannes_lab.chance import chance
+from hannes_lab.diagnose import OWN_ERROR_MOST, Diagnosis, _adequate, _worst, diagnose, effect_sources
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
+from hannes_lab.search import Search
 from hannes_lab.trials import make_trial
 from hannes_sim.effect import strength_of
 
@@ -34,6 +39,29 @@ def test_an_effect_of_the_full_hand_is_found_by_the_reduced_one() -> None:
     assert found.verdict == "effects" and [e.name for e in found.effects] == ["glove_stiffness"]
     # The full hand's own spring, felt at the pulley, is softer than the reduced one's: the glove makes up for it.
     assert found.effects[0].parameters["stiffness"].value == pytest.approx(0.002, rel=0.5)
+
+
+def test_an_error_in_one_signal_of_one_condition_is_not_lost_in_the_sum_over_all() -> None:
+    made, _ = make_set(Model.load(), [], seed=23, closures=5)
+    others = [replace(one, metadata={**one.metadata, "plant": "another"}) for one in made]
+    prepared = prepare([make_trial(recording) for recording in others], Model.load())
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, {})
+    null = search.null()
+    limits = chance(search.problem, null.fit, {})
+    where, error = _worst(search, null)
+    assert error < 1.0 and _adequate(search, null, limits)
+
+    problem, k = search.problem, 2
+    block, rows = problem.features.blocks[k], problem.features.slices[k]
+    wave = np.zeros(problem.features.size)
+    wave[rows][: block.phase.size] = problem.rig.own_error(block, prepared.model)
+    wave = 3.0 * problem.whiten(wave)
+    off = replace(null, fit=replace(null.fit, residual=wave, cost=float(wave @ wave)))
+    assert off.fit.cost < limits.misfit, "in the sum it is small"
+    where, error = _worst(search, off)
+    assert where == f"{block.signal} of '{block.condition}'"
+    assert error == pytest.approx(3.0) and error > OWN_ERROR_MOST
+    assert not _adequate(search, off, limits)
 
 
 def test_to_its_own_plant_a_model_has_no_error_of_its_own() -> None:

@@ -48,6 +48,11 @@ OWN_ERROR_PART = 0.1
 """The same where the model has an error of its own, also within chance: its width is assumed, and it is not noise.
 There a second effect must remove FURTHER times as much."""
 
+OWN_ERROR_MOST = 2.4
+"""Standard deviations of the model's own error that the error of one signal of one condition may reach as a root mean
+square.  A large error in few is lost in the sum over all: then what is left is not the model's form, but something
+that is missing."""
+
 TIE = 6.0
 """Sets whose penalised costs differ by less cannot be told apart: a likelihood ratio of e^3 = 20.  The best is the
 wrong one beyond it in 0.7 % at worst, of sets that are as far apart as that (normal tail at the root of 6)."""
@@ -269,7 +274,7 @@ def diagnose(
     )
     return Diagnosis(
         verdict=verdict,
-        summary=_summary(verdict, effects, tied, falls, limits, best, _nearest(choice)),
+        summary=_summary(verdict, effects, tied, falls, limits, best, _nearest(choice), _worst(search, best)),
         effects=effects,
         tied=tied,
         experiments=experiments,
@@ -334,7 +339,7 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
     front, far = [null], list[Candidate]()
     texts = ("one effect", "two effects", "three effects")
     for size in range(1, max_effects + 1):
-        enough = choice.best.fit.cost <= choice.limits.misfit
+        enough = _adequate(choice.search, choice.best, choice.limits, room=1.0)
         if enough and size > 1:
             room = choice.limits.misfit - choice.limits.median
             front = [c for c in front if c.penalised <= front[0].penalised + room]
@@ -372,8 +377,18 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
     return _pruned(choice)
 
 
-def _adequate(search: Search, candidate: Candidate, limits: Chance) -> bool:
-    return candidate.fit.cost <= limits.misfit * (1.0 if search.problem.discrepancy else ADEQUATE)
+def _adequate(search: Search, candidate: Candidate, limits: Chance, room: float = ADEQUATE) -> bool:
+    """Whether chance, with the model's own error if it has one, explains what a set leaves."""
+    if search.problem.discrepancy:
+        return candidate.fit.cost <= limits.misfit and _worst(search, candidate)[1] <= OWN_ERROR_MOST
+    return candidate.fit.cost <= limits.misfit * room
+
+
+def _worst(search: Search, candidate: Candidate) -> tuple[str, float]:
+    """Where the error is largest in standard deviations of the model's own error; 0 if it has none."""
+    errors = search.problem.own_errors(candidate.fit.residual)
+    block, error = max(errors, key=lambda item: item[1], default=(None, 0.0))
+    return (f"{block.signal} of '{block.condition}'" if block else "", error)
 
 
 def _tie(search: Search) -> float:
@@ -383,7 +398,7 @@ def _tie(search: Search) -> float:
 def _needed(choice: _Choice, base: Candidate, *, first: bool = False) -> float:
     """By how much a further effect must lower the penalised cost of a base; `first`: it is the first of the search."""
     limits = choice.limits
-    enough = base.fit.cost <= limits.misfit
+    enough = _adequate(choice.search, base, limits, room=1.0)
     part = OWN_ERROR_PART if choice.search.problem.discrepancy else 0.0 if enough else WORTHWHILE
     return max(limits.gain, part * base.fit.cost) * (FURTHER if enough and not first else 1.0)
 
@@ -673,6 +688,7 @@ def _summary(
     limits: Chance,
     best: Candidate,
     nearest: str,
+    worst: tuple[str, float],
 ) -> str:
     fall = fall_sentence(falls)
     far = _moved_far(best)
@@ -695,7 +711,9 @@ def _summary(
             tie = f" With these data it ties with: {others}."
         return f"Missing: {names}. {fall}{tie}{far}"
     part = f" The catalogue comes nearest with {names}, which is not enough." if names else ""
-    return (
-        f"Something is missing that is not in the catalogue: the best model's misfit {best.fit.cost:.0f} stays above "
-        f"what chance reaches ({limits.misfit:.0f}).{part} {fall}"
+    why = (
+        f"misfit {best.fit.cost:.0f} stays above what chance reaches ({limits.misfit:.0f})"
+        if best.fit.cost > limits.misfit
+        else f"error in {worst[0]} is {worst[1]:.1f} times as large as a model of this form is allowed to be off"
     )
+    return f"Something is missing that is not in the catalogue: the best model's {why}.{part} {fall}"

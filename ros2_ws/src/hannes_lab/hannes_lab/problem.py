@@ -188,6 +188,25 @@ class Problem:
             out[rows] = solve_triangular(lower, difference[rows], lower=True)
         return out
 
+    def own_errors(self, residual: Array) -> list[tuple[Block, float]]:
+        """Blocks for which the model has an error of its own, and how large their error is in its standard deviations.
+
+        residual    whitened (size,)
+        The root mean square over the phases, each weighted by the precision that is expected of the model there.
+        """
+        raw, sd = np.zeros(self.features.size), np.full(self.features.size, np.inf)
+        lowers = {rows.tobytes(): lower for rows, lower in self.whitener}
+        for rows, own in self.discrepancy:
+            raw[rows] = lowers[rows.tobytes()] @ residual[rows]
+            sd[rows] = np.linalg.norm(own, axis=1)
+        out = []
+        for block, where in zip(self.features.blocks, self.features.slices, strict=True):
+            precision = sd[where] ** -2.0
+            if precision.any():
+                square = float((raw[where] ** 2 * precision**2).sum() / precision.sum())
+                out.append((block, math.sqrt(square)))
+        return out
+
     def residual(self, model: Model, values: Mapping[str, float]) -> Array:
         """Whitened (measured - predicted), (size,); FAILED where the simulation diverges."""
         self.counts.simulations += 1

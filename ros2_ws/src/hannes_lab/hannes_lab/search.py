@@ -69,10 +69,14 @@ KEEP = 1
 """Points of each scan (from the base fit, and from the nominal values) from which an effect is refitted."""
 
 REFIT = 8
-"""Extensions of a round that are refitted in closed loop."""
+"""Extensions of a round that are fitted in closed loop to the end."""
+
+SHORT = 4
+LONG = 10
+"""Steps of a fit in closed loop; of the first one where more than REFIT extensions are to be told apart."""
 
 RIVAL_START = 2.0
-"""A second start of a fit is carried on to a slow plant if it costs less than so many times what the first reached."""
+"""A second start of a fit is carried on if it costs less than so many times what the first reached."""
 
 HOPELESS = 10.0
 """Sets whose cost is so many times that of the best are not followed; on a slow plant, by the scan already."""
@@ -84,7 +88,7 @@ REMOVED = 0.3
 """An approach that removes this part of its base's cost is never called hopeless: the way on may be long."""
 
 PULLED = 4.0
-"""Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are refitted: it may
+"""Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are approached: it may
 have taken over an effect, which a scan does not see."""
 
 NEAR = 2.0
@@ -312,11 +316,17 @@ class Search:
         return self._settled(base, name, starts, self._approaches(base, name, starts, worth), worth)
 
     def _approaches(
-        self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]], worth: float = np.inf
+        self,
+        base: Candidate,
+        name: str,
+        starts: Sequence[Mapping[str, float]],
+        worth: float = np.inf,
+        short: bool = False,
     ) -> list[Fit]:
         """Fits of the base set plus one effect from each start, best first; a slow plant runs at their ends only.
 
         worth   penalised cost below which the set is of interest
+        short   a few steps only, with all derivatives of the base taken as constant
         """
         model, coordinates = self.with_effects((*base.names, name))
         worth -= _penalty(coordinates)
@@ -336,7 +346,7 @@ class Search:
                 still = {c.name: at.get(c.name, 0.0) for c in coordinates if not c.prior}
                 ways += [(base.fit, at), (near, still)]
             for point, begin in ways:
-                known = _derivatives(point, [c for c in point.coordinates if c.prior])
+                known = _derivatives(point, [c for c in point.coordinates if short or c.prior])
                 found.append(
                     fit(
                         self.problem,
@@ -345,7 +355,7 @@ class Search:
                         begin,
                         rows=self.rows,
                         known=known,
-                        evaluations=10,
+                        evaluations=SHORT if short else LONG,
                         worth=worth,
                     )
                 )
@@ -358,12 +368,13 @@ class Search:
         starts: Sequence[Mapping[str, float]],
         approaches: Sequence[Fit],
         worth: float = np.inf,
+        short: bool = False,
     ) -> Candidate:
-        """The best that the approaches lead to: on a slow plant the first, and others that cost about as little."""
-        best = self._carried_on(approaches[0])
+        """The best that the approaches lead to: the first, and others that cost about as little."""
+        best = self._carried_on(approaches[0], worth, short)
         for other in approaches[1:]:
             if other.cost <= RIVAL_START * best.cost:
-                best = min(best, self._carried_on(other), key=lambda f: f.cost)
+                best = min(best, self._carried_on(other, worth, short), key=lambda f: f.cost)
         if best.cost > base.fit.cost:
             # The set contains the base: the search was led astray, and starts again from where the base is.
             strengths = {f"{name}.{p.name}" for p in self.effect(name).parameters if p.vanishing is not None}
@@ -376,14 +387,25 @@ class Search:
                 at,
                 rows=self.rows,
                 known={} if self.slow else _derivatives(base.fit),
-                evaluations=10,
+                evaluations=LONG,
                 worth=worth - _penalty(best.coordinates),
             )
-            best = min(best, self._carried_on(again), key=lambda f: f.cost)
+            best = min(best, self._carried_on(again, worth), key=lambda f: f.cost)
         return _candidate((*base.names, name), best)
 
-    def _carried_on(self, found: Fit) -> Fit:
-        """A fit carried on to the slow plant, in a few moves; on a fast plant it is there."""
+    def _carried_on(self, found: Fit, worth: float, short: bool = False) -> Fit:
+        """An approach carried on: a short one to its end, and to a slow plant in a few moves."""
+        if short and found.complete:
+            return fit(
+                self.problem,
+                found.model,
+                found.coordinates,
+                found.z,
+                rows=self.rows,
+                known=_derivatives(found, [c for c in found.coordinates if c.prior]),
+                evaluations=LONG,
+                worth=worth - _penalty(found.coordinates),
+            )
         return settle(self.problem, found, self.rows, moves=2, renew=False)[1]
 
     def _nearer(self, start: Mapping[str, float], base: Fit) -> Fit:
@@ -531,18 +553,25 @@ class Search:
     def _refits(
         self, chosen: Sequence[tuple[Candidate, str, list[Any]]], text: str, worth: float
     ) -> list[Candidate]:
-        """Fits in closed loop; on a slow plant those that the first of them leave hopeless are not carried on to it."""
-        if not self.slow:
-            return self.each(_add_in_worker, [(*item, worth) for item in chosen], f"{text}: refit")
-        found = self.each(_approach_in_worker, chosen, f"{text}: approach")
+        """Fits in closed loop: all are approached, and those that this does not leave hopeless are carried on."""
+        short = not self.slow and len(chosen) > REFIT
+        found = self.each(
+            _approach_in_worker, [(*item, worth, short) for item in chosen], f"{text}: approach"
+        )
         items = [(*item, fits) for item, fits in zip(chosen, found, strict=True)]
+        items.sort(key=lambda item: item[3][0].cost)
+        if not self.slow:
+            done = self.each(
+                _settle_in_worker, [(*item, worth, short) for item in items[:REFIT]], f"{text}: refit"
+            )
+            ended = [(base, name, replace(fits[0], complete=False)) for base, name, _, fits in items[REFIT:]]
+            return [*done, *(_candidate((*base.names, name), short) for base, name, short in ended)]
         # A further effect that gains nothing where its fit ends is near to where it would settle.
         items = [
             item
             for item in items
             if not item[0].names or _candidate(item[0].names, item[3][0]).penalised < item[0].penalised
         ]
-        items.sort(key=lambda item: item[3][0].cost)
         done = self.each(_settle_in_worker, items[:AHEAD], f"{text}: refit")
         least = min((c.fit.cost for c in done), default=np.inf)
         rest = [
@@ -732,15 +761,21 @@ def _add_in_worker(
 
 
 def _approach_in_worker(
-    search: Search, base: Candidate, name: str, starts: list[dict[str, float]]
+    search: Search, base: Candidate, name: str, starts: list[dict[str, float]], worth: float, short: bool
 ) -> list[Fit]:
-    return search._approaches(base, name, starts)
+    return search._approaches(base, name, starts, worth, short)
 
 
 def _settle_in_worker(
-    search: Search, base: Candidate, name: str, starts: list[dict[str, float]], approaches: list[Fit]
+    search: Search,
+    base: Candidate,
+    name: str,
+    starts: list[dict[str, float]],
+    approaches: list[Fit],
+    worth: float = np.inf,
+    short: bool = False,
 ) -> Candidate:
-    return search._settled(base, name, starts, approaches)
+    return search._settled(base, name, starts, approaches, worth, short)
 
 
 def _polish_in_worker(search: Search, candidate: Candidate, evaluations: int = 15) -> Candidate:
