@@ -193,7 +193,7 @@ def run_hannes(words: list[str], cache: Path, **options: object) -> "subprocess.
 @pytest.mark.timeout(600)
 def test_ctrl_c_in_the_first_round_and_the_same_command_goes_on(recordings: Path, tmp_path: Path) -> None:
     only = [word for name in ONLY for word in ("--only", name)]
-    words = ["diagnose", str(recordings), *only, "--json", "--jobs", "2"]
+    words = ["diagnose", str(recordings), *only, "--max-effects", "1", "--json", "--jobs", "2"]
     whole = run_hannes([*words, "--no-cache"], tmp_path / "none")
     out, err = whole.communicate()
     assert whole.returncode == 0, err

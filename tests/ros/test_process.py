@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -112,3 +114,11 @@ def test_diagnostics_tell_rate_age_and_counts(peer):
     assert {"input_age_s", "missed_cycles", "command_timeouts", "rejected_commands", "tick"} <= set(sim)
     assert {"input_age_s", "missed_cycles", "state_timeouts", "rejected_states", "active"} <= set(control)
     assert {status.name for status in peer.diagnostics} == {"/hannes/hand_sim", "/hannes/motor_controller"}
+
+
+@pytest.mark.parametrize("code", [0, 2])
+def test_a_process_that_is_stuck_with_the_interpreter_s_lock_leaves_by_its_deadline(code: int) -> None:
+    stuck = (f"import ctypes; from hannes_ros.leave import leave_within; print('said'); leave_within(0.3, {code}); "
+             "ctypes.PyDLL(None).sleep(60)")
+    answer = subprocess.run([sys.executable, "-c", stuck], capture_output=True, text=True, timeout=30, check=False)
+    assert (answer.returncode, answer.stdout) == (code, "said\n"), answer.stderr
