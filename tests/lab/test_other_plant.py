@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from hannes_description.model import Model
 from hannes_lab.chance import chance
-from hannes_lab.diagnose import OWN_ERROR_MOST, Diagnosis, _adequate, _worst, diagnose, effect_sources
+from hannes_lab.diagnose import (
+    OWN_ERROR_MOST,
+    Diagnosis,
+    _adequate,
+    _short_of,
+    _worst,
+    diagnose,
+    effect_sources,
+)
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.search import Search
@@ -62,6 +70,8 @@ def test_an_error_in_one_signal_of_one_condition_is_not_lost_in_the_sum_over_all
     assert where == f"{block.signal} of '{block.condition}'"
     assert error == pytest.approx(3.0) and error > OWN_ERROR_MOST
     assert not _adequate(search, off, limits)
+    said = _short_of(off, limits, (where, error))
+    assert said.startswith(f"error in {where} is 3.0 times"), said
 
 
 def test_to_its_own_plant_a_model_has_no_error_of_its_own() -> None:

@@ -315,14 +315,13 @@ def _grow(search: Search, null: Candidate, limits: Chance, max_effects: int) -> 
             "another speed or a grasp, or leave --greedy out."
         )
     grown = grow(search, null, max_effects, WORTHWHILE)
-    cost = grown.best.fit.cost
     adequate = _adequate(search, grown.best, limits)
     ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in grown.first)
     notes = list(grown.notes)
     if not adequate:
         notes.append(
-            f"the misfit ({cost:.0f}) stays above what chance reaches ({limits.misfit:.0f}): something smaller is left "
-            "that the catalogue does not explain"
+            f"the {_short_of(grown.best, limits, _worst(search, grown.best))}: something smaller is left that the "
+            "catalogue does not explain"
         )
     return _Choice(search, grown.best, limits, adequate, ranking, grown.rivals, tuple(notes))
 
@@ -711,9 +710,14 @@ def _summary(
             tie = f" With these data it ties with: {others}."
         return f"Missing: {names}. {fall}{tie}{far}"
     part = f" The catalogue comes nearest with {names}, which is not enough." if names else ""
-    why = (
-        f"misfit {best.fit.cost:.0f} stays above what chance reaches ({limits.misfit:.0f})"
-        if best.fit.cost > limits.misfit
-        else f"error in {worst[0]} is {worst[1]:.1f} times as large as a model of this form is allowed to be off"
-    )
+    why = _short_of(best, limits, worst)
     return f"Something is missing that is not in the catalogue: the best model's {why}.{part} {fall}"
+
+
+def _short_of(best: Candidate, limits: Chance, worst: tuple[str, float]) -> str:
+    """In what a set that is not adequate falls short."""
+    if best.fit.cost > limits.misfit:
+        return f"misfit {best.fit.cost:.0f} stays above what chance reaches ({limits.misfit:.0f})"
+    return (
+        f"error in {worst[0]} is {worst[1]:.1f} times as large as a model of this form is allowed to be off"
+    )
