@@ -373,7 +373,7 @@ class Search:
         """The best that the approaches lead to: the first, and others that cost about as little."""
         best = self._carried_on(approaches[0], worth, short)
         for other in approaches[1:]:
-            if other.cost <= RIVAL_START * best.cost:
+            if other.cost <= RIVAL_START * (approaches[0] if short else best).cost:
                 best = min(best, self._carried_on(other, worth, short), key=lambda f: f.cost)
         if best.cost > base.fit.cost:
             # The set contains the base: the search was led astray, and starts again from where the base is.
