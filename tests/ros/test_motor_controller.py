@@ -168,6 +168,9 @@ def test_hannes_motor_switches_a_running_controller(peer):
     nobody = motor("on", "--node", "/nobody/there", "--timeout", "0.5")
     assert nobody.returncode == 2
     assert nobody.stderr.count("\n") == 1 and "No lifecycle node '/nobody/there'" in nobody.stderr
+    wrong = motor("on", "--node", "/no name!")
+    assert wrong.returncode == 2
+    assert wrong.stderr.count("\n") == 1 and "'/no name!' is no name of a node" in wrong.stderr
 
 
 class Deaf:

@@ -34,29 +34,30 @@ def switch(name: str, on: bool | None, timeout: float) -> str:
     """
     with visit("motor", SingleThreadedExecutor) as (node, executor):
         asked = Lifecycle(node, executor, name, time.monotonic() + timeout)
-        try:
+        state = asked.state()
+        steps = {} if on is None else UP if on else DOWN
+        while state in steps:
+            done = asked.change(steps[state])
             state = asked.state()
-            steps = {} if on is None else UP if on else DOWN
-            while state in steps:
-                done = asked.change(steps[state])
-                state = asked.state()
-                if not done:
-                    break
-            return state
-        except InvalidServiceNameException as error:
-            raise HannesError(f"'{name}' is no name of a node: {str(error).splitlines()[0]}") from error
+            if not done:
+                break
+        return state
 
 
 class Lifecycle:
     """The lifecycle services of the node `name`, asked by `node`, which `executor` spins.
 
-    `until` is a time of the monotonic clock (s); each call raises HannesError if no answer came by then.
+    `until` is a time of the monotonic clock (s); each call raises HannesError if no answer came by then,
+    and so does the construction where the name is none.
     """
 
     def __init__(self, node: Node, executor: Executor, name: str, until: float) -> None:
         self._node, self._executor, self._name, self._until = node, executor, name, until
-        self._states = node.create_client(GetState, f"{name}/get_state")
-        self._changes = node.create_client(ChangeState, f"{name}/change_state")
+        try:
+            self._states = node.create_client(GetState, f"{name}/get_state")
+            self._changes = node.create_client(ChangeState, f"{name}/change_state")
+        except InvalidServiceNameException as error:
+            raise HannesError(f"'{name}' is no name of a node: {str(error).splitlines()[0]}") from error
 
     def state(self) -> str:
         """Label of the node's state; asked again until it answers."""
