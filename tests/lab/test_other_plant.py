@@ -70,7 +70,7 @@ def test_an_error_in_one_signal_of_one_condition_is_not_lost_in_the_sum_over_all
     assert where == f"{block.signal} of '{block.condition}'"
     assert error == pytest.approx(3.0) and error > OWN_ERROR_MOST
     assert not _adequate(search, off, limits)
-    said = _short_of(off, limits, (where, error))
+    said = _short_of(search, off, limits)
     assert said.startswith(f"error in {where} is 3.0 times"), said
 
 

@@ -274,7 +274,7 @@ def diagnose(
     )
     return Diagnosis(
         verdict=verdict,
-        summary=_summary(verdict, effects, tied, falls, limits, best, _nearest(choice), _worst(search, best)),
+        summary=_summary(search, verdict, effects, tied, falls, limits, best, _nearest(choice)),
         effects=effects,
         tied=tied,
         experiments=experiments,
@@ -320,7 +320,7 @@ def _grow(search: Search, null: Candidate, limits: Chance, max_effects: int) -> 
     notes = list(grown.notes)
     if not adequate:
         notes.append(
-            f"the {_short_of(grown.best, limits, _worst(search, grown.best))}: something smaller is left that the "
+            f"the {_short_of(search, grown.best, limits)}: something smaller is left that the "
             "catalogue does not explain"
         )
     return _Choice(search, grown.best, limits, adequate, ranking, grown.rivals, tuple(notes))
@@ -680,6 +680,7 @@ def fall_sentence(falls: Sequence[Fall]) -> str:
 
 
 def _summary(
+    search: Search,
     verdict: str,
     effects: Sequence[FoundEffect],
     tied: Sequence[Sequence[str]],
@@ -687,7 +688,6 @@ def _summary(
     limits: Chance,
     best: Candidate,
     nearest: str,
-    worst: tuple[str, float],
 ) -> str:
     fall = fall_sentence(falls)
     far = _moved_far(best)
@@ -710,14 +710,13 @@ def _summary(
             tie = f" With these data it ties with: {others}."
         return f"Missing: {names}. {fall}{tie}{far}"
     part = f" The catalogue comes nearest with {names}, which is not enough." if names else ""
-    why = _short_of(best, limits, worst)
+    why = _short_of(search, best, limits)
     return f"Something is missing that is not in the catalogue: the best model's {why}.{part} {fall}"
 
 
-def _short_of(best: Candidate, limits: Chance, worst: tuple[str, float]) -> str:
+def _short_of(search: Search, best: Candidate, limits: Chance) -> str:
     """In what a set that is not adequate falls short."""
     if best.fit.cost > limits.misfit:
         return f"misfit {best.fit.cost:.0f} stays above what chance reaches ({limits.misfit:.0f})"
-    return (
-        f"error in {worst[0]} is {worst[1]:.1f} times as large as a model of this form is allowed to be off"
-    )
+    where, error = _worst(search, best)
+    return f"error in {where} is {error:.1f} times as large as a model of this form is allowed to be off"

@@ -194,11 +194,11 @@ class Problem:
         residual    whitened (size,)
         The root mean square over the phases, each weighted by the precision that is expected of the model there.
         """
-        raw, sd = np.zeros(self.features.size), np.full(self.features.size, np.inf)
-        lowers = {rows.tobytes(): lower for rows, lower in self.whitener}
-        for rows, own in self.discrepancy:
-            raw[rows] = lowers[rows.tobytes()] @ residual[rows]
-            sd[rows] = np.linalg.norm(own, axis=1)
+        raw, sd = np.empty_like(residual), np.full(residual.size, np.inf)
+        for rows, lower in self.whitener:
+            raw[rows] = lower @ residual[rows]
+        for rows, lower in self.discrepancy:
+            sd[rows] = np.linalg.norm(lower, axis=1)
         out = []
         for block, where in zip(self.features.blocks, self.features.slices, strict=True):
             precision = sd[where] ** -2.0

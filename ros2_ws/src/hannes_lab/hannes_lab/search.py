@@ -143,7 +143,7 @@ class Search:
     def null(self) -> Candidate:
         """The model as it is, with its nuisance parameters fitted."""
         if () not in self.found:
-            self.found[()] = self.once(_null_in_worker, text="nominal: fit")
+            self.found[()] = self.once(Search._null, text="nominal: fit")
         return self.found[()]
 
     def _null(self) -> Candidate:
@@ -304,16 +304,14 @@ class Search:
         self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None = None
     ) -> Candidate:
         """Fit the base set plus one effect, from the best points of the scan (or the given ones)."""
-        found: Candidate = self.once(_add_in_worker, base, name, starts, np.inf, text=f"fit with {name}")
+        found: Candidate = self.once(Search._add, base, name, starts, text=f"fit with {name}")
         return self._known(found)
 
-    def _add(
-        self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None, worth: float
-    ) -> Candidate:
+    def _add(self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None) -> Candidate:
         if starts is None:
             model, coordinates = self.with_effects((*base.names, name))
             starts = [start for _, start in self.starts(name, base.fit, model, coordinates, KEEP)]
-        return self._settled(base, name, starts, self._approaches(base, name, starts, worth), worth)
+        return self._settled(base, name, starts, self._approaches(base, name, starts))
 
     def _approaches(
         self,
@@ -442,7 +440,7 @@ class Search:
 
     def polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
         """Refit from the candidate's point with all derivatives taken afresh."""
-        found: Candidate = self.once(_polish_in_worker, candidate, evaluations, text="polish")
+        found: Candidate = self.once(Search._polish, candidate, evaluations, text="polish")
         return self._known(found)
 
     def _polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
@@ -467,7 +465,7 @@ class Search:
 
     def with_spread(self, candidate: Candidate) -> Candidate:
         """The candidate with the derivatives from which its intervals are made."""
-        found: Candidate = self.once(_spread_in_worker, candidate, text="intervals")
+        found: Candidate = self.once(Search._with_spread, candidate, text="intervals")
         return self._known(found)
 
     def _with_spread(self, candidate: Candidate) -> Candidate:
@@ -494,7 +492,7 @@ class Search:
         index = [[c.name for c in larger.fit.coordinates].index(c.name) for c in coordinates]
         z, jacobian = larger.fit.z[index], larger.fit.jacobian[:, index]
         there = replace(larger.fit, model=model, coordinates=coordinates, z=z, jacobian=jacobian)
-        again: Candidate = self.once(_refit_in_worker, Candidate(names, there, np.inf), 15, text="without it")
+        again: Candidate = self.once(Search._refit, Candidate(names, there, np.inf), 15, text="without it")
         known = self.found.get(tuple(sorted(names)))
         return known if known is not None and known.fit.cost <= again.fit.cost else self._known(again)
 
@@ -509,7 +507,7 @@ class Search:
     def refitted(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         """Candidates of another problem, each fitted in this one unless it was already."""
         todo = [c for c in candidates if self.found.get(tuple(sorted(c.names))) is not c]
-        done = iter(self.each(_refit_in_worker, [(c, 8) for c in todo], "noise afresh: refit"))
+        done = iter(self.each(Search._refit, [(c, 8) for c in todo], "noise afresh: refit"))
         return [self._known(next(done) if c in todo else c) for c in candidates]
 
     # -- rounds -------------------------------------------------------------------------------------------------
@@ -547,7 +545,7 @@ class Search:
             # There polishing is long, and tells between sets that are close.
             close = [(c,) for (c,) in worthy if c.penalised <= HOPELESS * ranked[0].penalised]
             worthy = close if len(close) > 1 else []
-        polished = [self._known(c) for c in self.each(_polish_in_worker, worthy, f"{text}: polish")]
+        polished = [self._known(c) for c in self.each(Search._polish, worthy, f"{text}: polish")]
         return sorted([*polished, *ranked[len(polished) :]], key=lambda c: c.penalised)
 
     def _refits(
@@ -555,31 +553,30 @@ class Search:
     ) -> list[Candidate]:
         """Fits in closed loop: all are approached, and those that this does not leave hopeless are carried on."""
         short = not self.slow and len(chosen) > REFIT
-        found = self.each(
-            _approach_in_worker, [(*item, worth, short) for item in chosen], f"{text}: approach"
-        )
+        found = self.each(Search._approaches, [(*item, worth, short) for item in chosen], f"{text}: approach")
         items = [(*item, fits) for item, fits in zip(chosen, found, strict=True)]
         items.sort(key=lambda item: item[3][0].cost)
         if not self.slow:
             done = self.each(
-                _settle_in_worker, [(*item, worth, short) for item in items[:REFIT]], f"{text}: refit"
+                Search._settled, [(*item, worth, short) for item in items[:REFIT]], f"{text}: refit"
             )
-            ended = [(base, name, replace(fits[0], complete=False)) for base, name, _, fits in items[REFIT:]]
-            return [*done, *(_candidate((*base.names, name), short) for base, name, short in ended)]
+            rest = items[REFIT:]
+            ended = [_candidate((*b.names, n), replace(fits[0], complete=False)) for b, n, _, fits in rest]
+            return [*done, *ended]
         # A further effect that gains nothing where its fit ends is near to where it would settle.
         items = [
             item
             for item in items
             if not item[0].names or _candidate(item[0].names, item[3][0]).penalised < item[0].penalised
         ]
-        done = self.each(_settle_in_worker, items[:AHEAD], f"{text}: refit")
+        done = self.each(Search._settled, items[:AHEAD], f"{text}: refit")
         least = min((c.fit.cost for c in done), default=np.inf)
         rest = [
             item
             for item in items[AHEAD:]
             if item[3][0].cost <= max(HOPELESS * least, (1.0 - REMOVED) * item[0].fit.cost)
         ]
-        return [*done, *self.each(_settle_in_worker, rest, f"{text}: refit")]
+        return [*done, *self.each(Search._settled, rest, f"{text}: refit")]
 
     @staticmethod
     def _promising(rank: int, scanned: float, least: float, worth: float) -> bool:
@@ -658,7 +655,7 @@ class Search:
     def signatures(self, base: Candidate) -> dict[str, list[Array]]:
         """Whitened derivative of each effect at vanishing strength, per shape start; for what chance reaches."""
         names = [name for name in self.sources if name not in base.names]
-        found = self.each(_signature_in_worker, [(base, name) for name in names], "what chance reaches")
+        found = self.each(Search._signature, [(base, name) for name in names], "what chance reaches")
         return dict(zip(names, found, strict=True))
 
     def _signature(self, base: Candidate, name: str) -> list[Array]:
@@ -729,54 +726,10 @@ def _point_of(base: Fit) -> tuple[Names, bytes]:
     return names, base.z.tobytes()
 
 
-def _null_in_worker(search: Search) -> Candidate:
-    return search._null()
-
-
 def _prior_in_worker(search: Search, base: Candidate) -> Fit:
     return search.prior_point(base.fit)
-
-
-def _signature_in_worker(search: Search, base: Candidate, name: str) -> list[Array]:
-    return search._signature(base, name)
-
-
-def _spread_in_worker(search: Search, candidate: Candidate) -> Candidate:
-    return search._with_spread(candidate)
-
-
-def _refit_in_worker(search: Search, candidate: Candidate, evaluations: int) -> Candidate:
-    return search._refit(candidate, evaluations)
 
 
 def _scan_in_worker(search: Search, base: Candidate, name: str) -> list[tuple[float, dict[str, float]]]:
     model, coordinates = search.with_effects((*base.names, name))
     return search.starts(name, base.fit, model, coordinates, KEEP)
-
-
-def _add_in_worker(
-    search: Search, base: Candidate, name: str, starts: list[dict[str, float]] | None, worth: float
-) -> Candidate:
-    return search._add(base, name, starts, worth)
-
-
-def _approach_in_worker(
-    search: Search, base: Candidate, name: str, starts: list[dict[str, float]], worth: float, short: bool
-) -> list[Fit]:
-    return search._approaches(base, name, starts, worth, short)
-
-
-def _settle_in_worker(
-    search: Search,
-    base: Candidate,
-    name: str,
-    starts: list[dict[str, float]],
-    approaches: list[Fit],
-    worth: float = np.inf,
-    short: bool = False,
-) -> Candidate:
-    return search._settled(base, name, starts, approaches, worth, short)
-
-
-def _polish_in_worker(search: Search, candidate: Candidate, evaluations: int = 15) -> Candidate:
-    return search._polish(candidate, evaluations)

@@ -22,11 +22,11 @@ class _Times(ctypes.Structure):
     _fields_ = tuple((name, ctypes.c_long) for name in ("interval_s", "interval_ns", "first_s", "first_ns"))
 
 
-def leave_within(seconds: float, code: int) -> bool:
+def leave_within(seconds: float, code: int) -> None:
     """End the process with this exit code after so many seconds if it is still there; cannot be taken back.
 
     The timer calls _exit in a thread of the C library: a thread of Python's would wait for the interpreter's lock, held
-    by the one that is stuck.  False where the C library has no such timer; nothing happens then.
+    by the one that is stuck.  Where the C library has no such timer nothing happens.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -34,10 +34,9 @@ def leave_within(seconds: float, code: int) -> bool:
     try:
         create, start, function = library.timer_create, library.timer_settime, library._exit
     except AttributeError:
-        return False
+        return
     event = _Event(value=code, notify=_SIGEV_THREAD, function=ctypes.cast(function, ctypes.c_void_p).value)
     timer = ctypes.c_void_p()
     times = _Times(first_s=int(seconds), first_ns=int(seconds % 1.0 * 1e9))
-    if create(_CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) != 0:
-        return False
-    return bool(start(timer, 0, ctypes.byref(times), None) == 0)
+    if create(_CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0:
+        start(timer, 0, ctypes.byref(times), None)
