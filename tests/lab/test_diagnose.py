@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.add import add_effects
 from hannes_lab.chance import chance
@@ -54,6 +55,20 @@ def data(
 
 def run(prepared: Prepared) -> Diagnosis:
     return diagnose(prepared, effect_sources(model=prepared.model))
+
+
+def test_two_effects_of_one_name_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(OUTSIDE.replace('"latch"', '"stribeck_friction"'))
+    with pytest.raises(
+        HannesError, match=r"Two effects are named 'stribeck_friction': the catalogue's .* and .*Flap"
+    ):
+        effect_sources([f"{file}:Flap"])
+    assert effect_sources([f"{file}:Flap"], only=["gravity"]) == {
+        "gravity": "gravity",
+        "stribeck_friction": f"{file}:Flap",
+    }
+    assert "gravity" in effect_sources(["gravity"])
 
 
 def test_nothing_is_missing_in_clean_data() -> None:

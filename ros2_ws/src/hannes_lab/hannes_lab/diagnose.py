@@ -208,9 +208,20 @@ class Diagnosis:
 def effect_sources(
     extra: Sequence[str] = (), *, only: Sequence[str] | None = None, model: Model | None = None
 ) -> dict[str, str]:
-    """Effects to consider by name: the catalogue (or `only`) and the user's own, without those the model has."""
+    """Effects to consider by name: the catalogue (or `only`) and the user's own, without those the model has.
+
+    Two different effects of one name are a HannesError: results could not say which one they mean.
+    """
     names = list(only) if only is not None else list(catalogue())
-    out = {load_effect(given).name: given for given in (*names, *extra)}
+    out: dict[str, str] = {}
+    for given in (*names, *extra):
+        name = load_effect(given).name
+        if out.setdefault(name, given) != given:
+            first = out[name] if ":" in out[name] else f"the catalogue's {name}"
+            raise HannesError(
+                f"Two effects are named '{name}': {first} and {given}. Give yours a name of its own, or leave the "
+                "other one out (--only names the effects that take part)."
+            )
     have = {effect.name for effect in model.effects} if model is not None else set()
     return {name: given for name, given in out.items() if name not in have}
 

@@ -56,6 +56,11 @@ class Fit:
         return np.asarray(np.linalg.pinv(self.jacobian.T @ self.jacobian + prior) * inflate, dtype=np.float64)
 
 
+def prior_weights(coordinates: Sequence[Coordinate]) -> Array:
+    """(k,) 1 for each coordinate with a prior, 0 for the free ones."""
+    return np.array([1.0 if c.prior else 0.0 for c in coordinates])
+
+
 ROUGHNESS = 20.0
 """Least change of the whitened prediction (root of the sum of squares) by which a derivative along a strength is taken.
 A simulation with dry friction is rough: a change by next to nothing already moves the prediction by about 1."""
@@ -190,7 +195,7 @@ def fit(
         else np.array(start)
     )
     bounds = np.array([c.bounds for c in coordinates]).T if coordinates else np.zeros((2, 0))
-    priors = np.array([1.0 if c.prior else 0.0 for c in coordinates])
+    priors = prior_weights(coordinates)
     use = np.ones(problem.features.size, dtype=bool) if rows is None else rows
     cache: dict[bytes, Array] = {}
 

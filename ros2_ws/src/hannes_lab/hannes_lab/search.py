@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from .cache import Codec, NotPlain, Store, code_hash, content_hash
 from .errors import SignalError
 from .executor import Executor, Held, own
-from .fit import Fit, finite_differences, fit, linear_minimum, over_its_spread, spread
+from .fit import Fit, finite_differences, fit, over_its_spread, spread
 from .problem import (
     Coordinate,
     Counts,
@@ -30,20 +29,13 @@ from .problem import (
     vanishing_entry,
 )
 from .rig import Nuisance
-from .settle import at_anchor, settle, slopes_at
-from .spectrum import position_periods
-from .surrogate import AnchoredRig, anchored_at
+from .scan import Scan, Scored, farthest, point_key
+from .settle import at_anchor, seen_from, settle, slopes_at
+from .surrogate import AnchoredRig
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 Names = tuple[str, ...]
-
-STRENGTHS = (0.01, 0.1, 1.0, 4.0, 16.0)
-"""Strengths of the scan, in typical values; both signs where the bounds allow.  Each point is followed to where the
-straight line through it and the point without the effect says that the best strength is."""
-
-FOLLOW = 3
-"""Points of a scan that are followed."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +49,8 @@ class Candidate:
     @property
     def pulled(self) -> bool:
         """True where a nuisance parameter is far from its nominal value."""
-        return _off(self.fit) > PULLED
+        return farthest(self.fit) > PULLED
 
-
-FINE = tuple(0.5 * 1.2**k for k in range(16))
-STRAY = 2.0
-"""Strengths that are scanned too where the others leave so many times more squares than there are samples: a hand that
-sticks fits in a narrow range of strengths only, which lies anywhere between theirs."""
-
-KEEP = 1
-"""Points of each scan (from the base fit, and from the nominal values) from which an effect is refitted."""
 
 REFIT = 8
 """Extensions of a round that are fitted in closed loop to the end."""
@@ -90,9 +74,6 @@ REMOVED = 0.3
 PULLED = 4.0
 """Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are approached: it may
 have taken over an effect, which a scan does not see."""
-
-NEAR = 2.0
-"""A base whose nuisance parameters are all within so many standard deviations is scanned from where it is alone."""
 
 POLISH = 3
 """Extensions of a round that are refitted with all derivatives afresh."""
@@ -121,15 +102,12 @@ class Search:
     progress: Progress = silent
     rows: NDArray[np.bool_] | None = None
     found: dict[Names, Candidate] = field(default_factory=dict)
-    _prior_points: dict[tuple[Names, bytes], Fit] = field(default_factory=dict)
+    _nominal: dict[bytes, Fit] = field(default_factory=dict)
     _key: str = ""
 
     def __post_init__(self) -> None:
         self.coordinates = tuple(nuisance_coordinate(n) for n in self.nuisances)
-
-    def seen(self, base: Fit) -> Problem:
-        """The problem as seen from a fit: a slow plant's anchor is there."""
-        return self.problem.with_rig(anchored_at(self.problem.rig, base.model, base.values))
+        self.scan = Scan(self.problem, self.rows, self._nominal)
 
     @property
     def slow(self) -> bool:
@@ -161,157 +139,20 @@ class Search:
             coordinates += effect_coordinates(kind)
         return model, tuple(coordinates)
 
-    def starts(
-        self, name: str, base: Fit, model: Model, coordinates: Sequence[Coordinate], keep: int
-    ) -> list[tuple[float, dict[str, float]]]:
-        """Best starting points of one effect on top of a fit, by a scan with the nuisance parameters compensated.
-
-        Scans the strength at every start of the shape parameters; what the nuisance parameters could take over is
-        projected out linearly.
-        """
-        own = {c.name: c for c in effect_coordinates(self.effect(name))}
-        shapes, strengths = [], []
-        for p in self.effect(name).parameters:
-            c = own[f"{name}.{p.name}"]
-            if p.vanishing is None:
-                found = position_periods(self.seen(base), base, p.lower, p.upper) if p.period else ()
-                shapes.append([(c.name, c.z(v)) for v in (*(p.starts or (p.typical,)), *found)])
-            else:
-                low, high = c.bounds
-                points = [c.z(v) for v in p.starts] or [z for s in STRENGTHS for z in (s, -s)]
-                strengths.append([(c.name, z) for z in points if low <= z <= high])
-        trials: list[tuple[dict[str, float], tuple[str, float]]] = []
-        for shape in itertools.product(*shapes):
-            for group in strengths:
-                trials += [(dict((*shape, one)), one) for one in group]
-        # The amplitudes of one wave, or the halves of a difference, are right together only.
-        joint = list(itertools.product(*shapes)) if len(strengths) > 1 else []
-        scored: list[list[tuple[float, dict[str, float]]]] = []
-        places = (base, self.prior_point(base)) if _off(base) > NEAR else (base,)
-        for point in places:
-            here = {c.name: float(z) for c, z in zip(point.coordinates, point.z, strict=True)}
-            problem = self.seen(point)
-
-            def at(
-                start: Mapping[str, float], here: dict[str, float] = here, problem: Problem = problem
-            ) -> Array:
-                z = {**here, **start}
-                return problem.residual(model, {c.name: c.value(z.get(c.name, 0.0)) for c in coordinates})
-
-            def score(
-                start: dict[str, float], residual: Array, point: Fit = point
-            ) -> tuple[float, dict[str, float]]:
-                cost, z_base = self.compensated(residual, point)
-                moved = {c.name: float(v) for c, v in zip(point.coordinates, z_base, strict=True)}
-                return cost, {**moved, **start}
-
-            scores, follow = [], []
-            for start, (strength, z_strength) in trials:
-                residual = at(start)
-                scores.append(score(start, residual))
-                if z_strength != 0.0:
-                    cost, best = self.followed((residual - point.residual) / z_strength, point)
-                    low, high = own[strength].bounds
-                    if 0.05 < best / z_strength < 20.0 and low <= best <= high:
-                        follow.append((cost, {**start, strength: best}))
-            for _, start in sorted(follow, key=lambda item: item[0])[:FOLLOW]:
-                scores.append(score(start, at(start)))
-            left, lowest = min(scores, key=lambda item: item[0])
-            if point is places[-1] and len(strengths) == 1 and left > STRAY * point.residual.size:
-                strength = strengths[0][0][0]
-                sign, (low, high) = math.copysign(1.0, lowest[strength]), own[strength].bounds
-                for z in (sign * size for size in FINE if low <= sign * size <= high):
-                    start = {**{parameter: lowest[parameter] for parameter in own}, strength: z}
-                    scores.append(score(start, at(start)))
-            for shape in joint:
-                start = self._joint_start(point, dict(shape), own, model, coordinates)
-                scores.append(score(start, at(start)))
-            scored.append(sorted(scores, key=lambda item: item[0])[:keep])
-        return sorted((one for scores in scored for one in scores), key=lambda item: item[0])
-
-    def _joint_start(
-        self,
-        base: Fit,
-        shape: Mapping[str, float],
-        own: Mapping[str, Coordinate],
-        model: Model,
-        coordinates: Sequence[Coordinate],
-    ) -> dict[str, float]:
-        """All strengths of an effect by one Gauss-Newton step from nought, together with the base's coordinates."""
-        use = slice(None) if self.rows is None else self.rows
-        strengths = [k for k, c in enumerate(coordinates) if c.name in own and c.name not in shape]
-        here = {c.name: float(z) for c, z in zip(base.coordinates, base.z, strict=True)}
-        z = np.array([{**here, **shape}.get(c.name, 0.0) for c in coordinates])
-        added = finite_differences(self.seen(base), model, coordinates, z, base.residual, strengths)
-        prior = np.array([1.0 if c.prior else 0.0 for c in base.coordinates] + [0.0] * len(strengths))
-        pull = np.concatenate([base.z, np.zeros(len(strengths))])
-        a = np.vstack([np.column_stack([base.jacobian[use], added[use]]), np.diag(prior)])
-        target = np.concatenate([base.residual[use], prior * pull])
-        step = -np.linalg.lstsq(a, target, rcond=None)[0]
-        out = dict(shape)
-        for k, s in zip(strengths, step[base.z.size :], strict=True):
-            low, high = coordinates[k].bounds
-            out[coordinates[k].name] = float(np.clip(s, low, high))
-        return out
-
-    def followed(self, derivative: Array, base: Fit) -> tuple[float, float]:
-        """Least cost along one more direction, with the base fit's coordinates compensating, and how far along it."""
-        use = slice(None) if self.rows is None else self.rows
-        prior = np.array([1.0 if c.prior else 0.0 for c in base.coordinates])
-        cost, z = linear_minimum(
-            np.column_stack([base.jacobian[use], derivative[use]]),
-            base.residual[use],
-            np.append(base.z, 0.0),
-            np.append(prior, 0.0),
-        )
-        return cost, float(z[-1])
-
-    def prior_point(self, base: Fit) -> Fit:
-        """The base's effects with the nuisance parameters back at their nominal values.
-
-        A fit without the true effect may have driven a nuisance parameter far off; the truth is near the prior's mean.
-        """
-        key = _point_of(base)
-        if key not in self._prior_points:
-            z = np.array(
-                [0.0 if c.prior else float(v) for c, v in zip(base.coordinates, base.z, strict=True)]
-            )
-            values = {c.name: c.value(float(v)) for c, v in zip(base.coordinates, z, strict=True)}
-            problem = self.problem.with_rig(anchored_at(self.problem.rig, base.model, values))
-            r = problem.residual(base.model, values)
-            jacobian = finite_differences(problem, base.model, base.coordinates, z, r, range(z.size))
-            self._prior_points[key] = Fit(base.model, base.coordinates, z, float(r @ r), r, jacobian)
-        return self._prior_points[key]
-
-    def compensated(self, residual: Array, base: Fit) -> tuple[float, Array]:
-        """Cost of a residual after the linear best move of the base fit's coordinates, and where they move to."""
-        use = slice(None) if self.rows is None else self.rows
-        prior = np.array([1.0 if c.prior else 0.0 for c in base.coordinates])
-        cost, z = linear_minimum(base.jacobian[use], residual[use], base.z, prior)
-        return cost, self._inside(z, base)
-
-    @staticmethod
-    def _inside(z: Array, base: Fit) -> Array:
-        """Within the bounds; nuisance parameters also within eight standard deviations, or as far off as the base."""
-        bounds = np.array([c.bounds for c in base.coordinates]).reshape(-1, 2)
-        for k, c in enumerate(base.coordinates):
-            if c.prior:
-                reach = max(8.0, abs(float(base.z[k])))
-                bounds[k] = max(-reach, bounds[k, 0]), min(reach, bounds[k, 1])
-        return np.asarray(np.clip(z, bounds[:, 0], bounds[:, 1]), dtype=np.float64)
-
-    def add(
-        self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None = None
-    ) -> Candidate:
-        """Fit the base set plus one effect, from the best points of the scan (or the given ones)."""
-        found: Candidate = self.once(Search._add, base, name, starts, text=f"fit with {name}")
+    def add(self, base: Candidate, name: str) -> Candidate:
+        """Fit the base set plus one effect, from the best points of the scan."""
+        found: Candidate = self.once(Search._add, base, name, text=f"fit with {name}")
         return self._known(found)
 
-    def _add(self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]] | None) -> Candidate:
-        if starts is None:
-            model, coordinates = self.with_effects((*base.names, name))
-            starts = [start for _, start in self.starts(name, base.fit, model, coordinates, KEEP)]
+    def _add(self, base: Candidate, name: str) -> Candidate:
+        starts = [start for _, start in self._scanned(base, name)]
         return self._settled(base, name, starts, self._approaches(base, name, starts))
+
+    def _scanned(self, base: Candidate, name: str) -> list[Scored]:
+        return self.scan.starts(self.effect(name), base.fit, *self.with_effects((*base.names, name)))
+
+    def _at_nominal(self, base: Candidate) -> Fit:
+        return self.scan.at_nominal(base.fit)
 
     def _approaches(
         self,
@@ -330,10 +171,12 @@ class Search:
         worth -= _penalty(coordinates)
         found = []
         for start in starts:
-            near = self._nearer(start, base.fit)
-            at = self._true_start(base.fit, model, coordinates, start)
+            near = self.scan.nearer(start, base.fit)
+            at = self.scan.true_start(base.fit, model, coordinates, start)
             if self.slow:
-                one = fit(self.seen(near), model, coordinates, at, rows=self.rows, evaluations=15)
+                one = fit(
+                    seen_from(self.problem, near), model, coordinates, at, rows=self.rows, evaluations=15
+                )
                 # Costs that were seen from different places cannot be compared before the anchor is there.
                 found.append(at_anchor(self.problem, one, self.rows)[1])
                 continue
@@ -379,7 +222,7 @@ class Search:
             here = {c.name: float(z) for c, z in zip(base.fit.coordinates, base.fit.z, strict=True)}
             at = {**starts[0], **here, **dict.fromkeys(strengths, 0.0)}
             again = fit(
-                self.seen(base.fit),
+                seen_from(self.problem, base.fit),
                 best.model,
                 best.coordinates,
                 at,
@@ -406,33 +249,6 @@ class Search:
             )
         return settle(self.problem, found, self.rows, moves=2, renew=False)[1]
 
-    def _nearer(self, start: Mapping[str, float], base: Fit) -> Fit:
-        """Where a fit from a start looks from: the base, or its nominal nuisance parameters if they are nearer.
-
-        A slow plant is anchored there; on a fast one the derivatives by the nuisance parameters are tried from there
-        too, since those of a base that a strong effect drove far off lead nowhere.
-        """
-        z = np.array([start.get(c.name, 0.0) for c in base.coordinates if c.prior])
-        there = np.array([v for c, v in zip(base.coordinates, base.z, strict=True) if c.prior])
-        return self.prior_point(base) if z @ z < (z - there) @ (z - there) else base
-
-    def _true_start(
-        self, base: Fit, model: Model, coordinates: Sequence[Coordinate], start: Mapping[str, float]
-    ) -> Mapping[str, float]:
-        """The start as the scan gave it, or with the base left where it is: whichever costs less in closed loop.
-
-        The scan moves the base linearly; where effects of the base are far from linear, that leads astray.
-        """
-        if not any(not c.prior for c in base.coordinates):
-            return start
-        kept = {**start, **{c.name: float(z) for c, z in zip(base.coordinates, base.z, strict=True)}}
-        use = slice(None) if self.rows is None else self.rows
-        problem, costs = self.seen(base), []
-        for one in (start, kept):
-            r = problem.residual(model, {c.name: c.value(one.get(c.name, 0.0)) for c in coordinates})[use]
-            costs.append(float(r @ r) + sum(one.get(c.name, 0.0) ** 2 for c in coordinates if c.prior))
-        return start if costs[0] <= costs[1] else kept
-
     def _known(self, candidate: Candidate) -> Candidate:
         if candidate.fit.complete:
             self.found[tuple(sorted(candidate.names))] = candidate
@@ -453,7 +269,7 @@ class Search:
     def _again(self, old: Fit, evaluations: int) -> Fit:
         """A fit from where another ended, carried on to the slow plant itself where there is one."""
         found = fit(
-            self.seen(old),
+            seen_from(self.problem, old),
             old.model,
             old.coordinates,
             old.z,
@@ -474,7 +290,7 @@ class Search:
 
     def renewed(self, best: Candidate) -> Search:
         """The same search with noise and scatter estimated at another point: sensitivities there are the true ones."""
-        rig = anchored_at(self.problem.rig, best.fit.model, best.fit.values)
+        rig = seen_from(self.problem, best.fit).rig
         problem = build_problem(
             rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values, self.problem.counts
         )
@@ -524,9 +340,11 @@ class Search:
             for name in names:
                 if name not in base.names:
                     todo.setdefault(tuple(sorted((*base.names, name))), (base, name))
-        points = self.each(_prior_in_worker, [(base,) for base in bases], f"{text}: nominal values")
-        self._prior_points = {_point_of(base.fit): point for base, point in zip(bases, points, strict=True)}
-        scans = self.each(_scan_in_worker, list(todo.values()), f"{text}: scan")
+        points = self.each(Search._at_nominal, [(base,) for base in bases], f"{text}: nominal values")
+        self._nominal = self.scan.nominal = {
+            point_key(base.fit): point for base, point in zip(bases, points, strict=True)
+        }
+        scans = self.each(Search._scanned, list(todo.values()), f"{text}: scan")
         order = sorted(zip(todo.values(), scans, strict=True), key=lambda item: item[1][0][0])
         least = order[0][1][0][0] if order else np.inf
         chosen = [
@@ -624,7 +442,7 @@ class Search:
         work = [(function, items[k]) for k in missing]
         key = f"{next(_runs)} {id(self)} {os.getpid()} {time.time_ns()}"
         for number, (result, simulations, failures) in self.executor.run(
-            _work, (*shared, self._prior_points), key, work
+            _work, (*shared, self._nominal), key, work
         ):
             self.problem.counts.simulations += simulations
             self.problem.counts.failures += failures
@@ -691,7 +509,7 @@ def _work(
     def build() -> Search:
         problem, model, nuisances, sources, rows, points = shared
         problem = replace(problem, rig=own(problem.rig), counts=Counts())
-        return Search(problem, model, nuisances, sources, rows=rows, _prior_points=dict(points))
+        return Search(problem, model, nuisances, sources, rows=rows, _nominal=dict(points))
 
     search = _held.get(key, build)
     counts = search.problem.counts
@@ -709,27 +527,6 @@ def _penalty(coordinates: Sequence[Coordinate]) -> float:
     return PENALTY * sum(not c.prior for c in coordinates)
 
 
-def _off(found: Fit) -> float:
-    """How many standard deviations the nuisance parameters are from their nominal values at most."""
-    return max(
-        (abs(float(z)) for c, z in zip(found.coordinates, found.z, strict=True) if c.prior), default=0.0
-    )
-
-
 def _derivatives(found: Fit, of: Sequence[Coordinate] | None = None) -> dict[str, Array]:
     """Derivatives (size,) at a fit by coordinate name; of all its coordinates if not of some."""
     return {c.name: found.jacobian[:, j] for j, c in enumerate(found.coordinates) if of is None or c in of}
-
-
-def _point_of(base: Fit) -> tuple[Names, bytes]:
-    names = tuple(dict.fromkeys(c.name.split(".")[0] for c in base.coordinates if not c.prior))
-    return names, base.z.tobytes()
-
-
-def _prior_in_worker(search: Search, base: Candidate) -> Fit:
-    return search.prior_point(base.fit)
-
-
-def _scan_in_worker(search: Search, base: Candidate, name: str) -> list[tuple[float, dict[str, float]]]:
-    model, coordinates = search.with_effects((*base.names, name))
-    return search.starts(name, base.fit, model, coordinates, KEEP)

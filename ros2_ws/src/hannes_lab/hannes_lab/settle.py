@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .fit import Fit, fit, spread
+from .fit import Fit, fit, prior_weights, spread
 from .problem import Problem
 from .rig import Rig
 from .surrogate import AnchoredRig, anchored_at
@@ -21,12 +21,17 @@ SETTLED = 1.0
 LITTLE = 0.002
 
 
+def seen_from(problem: Problem, found: Fit) -> Problem:
+    """The problem as seen from a fit: a slow plant's anchor is there."""
+    return problem.with_rig(anchored_at(problem.rig, found.model, found.values))
+
+
 def at_anchor(problem: Problem, found: Fit, rows: NDArray[np.bool_] | None) -> tuple[Problem, Fit]:
     """The problem with its anchor at a fit, and the fit with the residual that the slow plant has there."""
-    problem = problem.with_rig(anchored_at(problem.rig, found.model, found.values))
+    problem = seen_from(problem, found)
     residual = problem.residual(found.model, found.values)
     used = residual if rows is None else residual[rows]
-    prior = np.array([1.0 if c.prior else 0.0 for c in found.coordinates])
+    prior = prior_weights(found.coordinates)
     cost = float(used @ used + (prior * found.z) @ (prior * found.z))
     return problem, replace(found, residual=residual, cost=cost)
 

@@ -1,0 +1,243 @@
+"""Where the fit of one further effect starts: its strengths and shapes are tried with all else compensated linearly."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from hannes_description.model import Model
+from hannes_sim.effect import EffectType
+from numpy.typing import NDArray
+
+from .fit import Fit, finite_differences, linear_minimum, prior_weights
+from .problem import Coordinate, Problem, effect_coordinates
+from .settle import seen_from
+from .spectrum import position_periods
+
+Array = NDArray[np.float64]
+Point = dict[str, float]
+"""Whitened coordinates by name."""
+
+Scored = tuple[float, Point]
+"""Cost of a point after the linear best move of all else, and the point with that move."""
+
+STRENGTHS = (0.01, 0.1, 1.0, 4.0, 16.0)
+"""Strengths of the scan, in typical values; both signs where the bounds allow.  Each point is followed to where the
+straight line through it and the point without the effect says that the best strength is."""
+
+FOLLOW = 3
+"""Points of a scan that are followed."""
+
+FOLLOWED = (0.05, 20.0)
+"""How far, in strengths of the point itself, it is followed at most."""
+
+FINE = tuple(0.5 * 1.2**k for k in range(16))
+STRAY = 2.0
+"""Strengths that are scanned too where the others leave so many times more squares than there are samples: a hand that
+sticks fits in a narrow range of strengths only, which lies anywhere between theirs."""
+
+NEAR = 2.0
+"""A base whose nuisance parameters are all within so many standard deviations is scanned from where it is alone."""
+
+REACH = 8.0
+"""Standard deviations to which a scan moves a nuisance parameter, unless the base is farther off already."""
+
+
+@dataclass
+class Scan:
+    """Scans on one problem.
+
+    rows    features that take part; None: all
+    nominal bases with their nuisance parameters at the nominal values, as far as they are known
+    """
+
+    problem: Problem
+    rows: NDArray[np.bool_] | None = None
+    nominal: dict[bytes, Fit] = field(default_factory=dict)
+
+    def at_nominal(self, base: Fit) -> Fit:
+        """The base's effects with the nuisance parameters back at their nominal values.
+
+        A fit without the true effect may have driven a nuisance parameter far off; the truth is near the prior's mean.
+        """
+        key = point_key(base)
+        if key not in self.nominal:
+            z = np.where(prior_weights(base.coordinates) > 0.0, 0.0, base.z)
+            there = replace(base, z=z)
+            problem = seen_from(self.problem, there)
+            r = problem.residual(base.model, there.values)
+            jacobian = finite_differences(problem, base.model, base.coordinates, z, r, range(z.size))
+            self.nominal[key] = replace(
+                there, cost=float(r @ r), residual=r, jacobian=jacobian, complete=True
+            )
+        return self.nominal[key]
+
+    def starts(
+        self, kind: EffectType, base: Fit, model: Model, coordinates: Sequence[Coordinate]
+    ) -> list[Scored]:
+        """Best starting points of an effect on top of a fit: from the base, and from its nominal values if it is off.
+
+        kind                what is added; `model` and `coordinates` are those of the base with it
+        """
+        places = (base, self.at_nominal(base)) if farthest(base) > NEAR else (base,)
+        grid = _grid(kind, seen_from(self.problem, base), base)
+        best = []
+        for place in places:
+            scan = _Place(self, kind, place, model, coordinates)
+            best.append(min(scan.scored(*grid, last=place is places[-1]), key=lambda item: item[0]))
+        return sorted(best, key=lambda item: item[0])
+
+    def nearer(self, start: Mapping[str, float], base: Fit) -> Fit:
+        """Where a fit from a start looks from: the base, or its nominal nuisance parameters if they are nearer.
+
+        A slow plant is anchored there; on a fast one the derivatives by the nuisance parameters are tried from there
+        too, since those of a base that a strong effect drove far off lead nowhere.
+        """
+        z = np.array([start.get(c.name, 0.0) for c in base.coordinates if c.prior])
+        there = base.z[prior_weights(base.coordinates) > 0.0]
+        return self.at_nominal(base) if z @ z < (z - there) @ (z - there) else base
+
+    def true_start(
+        self, base: Fit, model: Model, coordinates: Sequence[Coordinate], start: Mapping[str, float]
+    ) -> Mapping[str, float]:
+        """The start as the scan gave it, or with the base left where it is: whichever costs less in closed loop.
+
+        The scan moves the base linearly; where effects of the base are far from linear, that leads astray.
+        """
+        if all(c.prior for c in base.coordinates):
+            return start
+        kept = {**start, **_point(base)}
+        problem, costs = seen_from(self.problem, base), []
+        for one in (start, kept):
+            r = problem.residual(model, {c.name: c.value(one.get(c.name, 0.0)) for c in coordinates})[
+                self.use
+            ]
+            costs.append(float(r @ r) + sum(one.get(c.name, 0.0) ** 2 for c in coordinates if c.prior))
+        return start if costs[0] <= costs[1] else kept
+
+    @property
+    def use(self) -> slice | NDArray[np.bool_]:
+        return slice(None) if self.rows is None else self.rows
+
+
+class _Place:
+    """The scan of one effect from one place."""
+
+    def __init__(
+        self, scan: Scan, kind: EffectType, place: Fit, model: Model, coordinates: Sequence[Coordinate]
+    ) -> None:
+        self.place, self.model, self.coordinates = place, model, coordinates
+        self.own = {c.name: c for c in effect_coordinates(kind)}
+        self.here, self.problem, self.use = _point(place), seen_from(scan.problem, place), scan.use
+
+    def scored(
+        self, shapes: Sequence[Point], strengths: Mapping[str, Sequence[float]], *, last: bool
+    ) -> Iterator[Scored]:
+        """All points of the scan; finely around the best one where that is a stray, if this is the last place."""
+        scores, follow = [], []
+        for shape in shapes:
+            for name, z in ((name, z) for name, points in strengths.items() for z in points):
+                start = {**shape, name: z}
+                residual = self.at(start)
+                scores.append(self.score(start, residual))
+                if z == 0.0:
+                    continue
+                cost, best = self.followed((residual - self.place.residual) / z)
+                low, high = self.own[name].bounds
+                if FOLLOWED[0] < best / z < FOLLOWED[1] and low <= best <= high:
+                    follow.append((cost, {**start, name: best}))
+        scores += [self.score(start) for _, start in sorted(follow, key=lambda item: item[0])[:FOLLOW]]
+        yield from scores
+        if len(strengths) > 1:
+            # The amplitudes of one wave, or the halves of a difference, are right together only.
+            yield from (self.score(self.joint(shape)) for shape in shapes)
+            return
+        left, lowest = min(scores, key=lambda item: item[0])
+        if last and left > STRAY * self.place.residual.size:
+            (name,) = strengths
+            sign, (low, high) = math.copysign(1.0, lowest[name]), self.own[name].bounds
+            shape = {parameter: lowest[parameter] for parameter in self.own}
+            for z in (sign * size for size in FINE if low <= sign * size <= high):
+                yield self.score({**shape, name: z})
+
+    def at(self, start: Mapping[str, float]) -> Array:
+        z = {**self.here, **start}
+        return self.problem.residual(
+            self.model, {c.name: c.value(z.get(c.name, 0.0)) for c in self.coordinates}
+        )
+
+    def score(self, start: Mapping[str, float], residual: Array | None = None) -> Scored:
+        """Cost of a start after the linear best move of the place's coordinates."""
+        residual = self.at(start) if residual is None else residual
+        place = self.place
+        cost, z = linear_minimum(
+            place.jacobian[self.use], residual[self.use], place.z, prior_weights(place.coordinates)
+        )
+        bounds = np.array([c.bounds for c in place.coordinates]).reshape(-1, 2)
+        for k, c in enumerate(place.coordinates):
+            if c.prior:
+                reach = max(REACH, abs(float(place.z[k])))
+                bounds[k] = max(-reach, bounds[k, 0]), min(reach, bounds[k, 1])
+        moved = np.clip(z, bounds[:, 0], bounds[:, 1])
+        return cost, {**{c.name: float(v) for c, v in zip(place.coordinates, moved, strict=True)}, **start}
+
+    def followed(self, derivative: Array) -> tuple[float, float]:
+        """Least cost along one more direction, with the place's coordinates compensating, and how far along it."""
+        place = self.place
+        cost, z = linear_minimum(
+            np.column_stack([place.jacobian[self.use], derivative[self.use]]),
+            place.residual[self.use],
+            np.append(place.z, 0.0),
+            np.append(prior_weights(place.coordinates), 0.0),
+        )
+        return cost, float(z[-1])
+
+    def joint(self, shape: Mapping[str, float]) -> Point:
+        """All strengths of the effect by one Gauss-Newton step from nought, together with the place's coordinates."""
+        place = self.place
+        strengths = [k for k, c in enumerate(self.coordinates) if c.name in self.own and c.name not in shape]
+        z = np.array([{**self.here, **shape}.get(c.name, 0.0) for c in self.coordinates])
+        added = finite_differences(self.problem, self.model, self.coordinates, z, place.residual, strengths)
+        prior = np.append(prior_weights(place.coordinates), np.zeros(len(strengths)))
+        pull = np.append(place.z, np.zeros(len(strengths)))
+        a = np.vstack([np.column_stack([place.jacobian[self.use], added[self.use]]), np.diag(prior)])
+        target = np.concatenate([place.residual[self.use], prior * pull])
+        step = -np.linalg.lstsq(a, target, rcond=None)[0]
+        out = dict(shape)
+        for k, s in zip(strengths, step[place.z.size :], strict=True):
+            low, high = self.coordinates[k].bounds
+            out[self.coordinates[k].name] = float(np.clip(s, low, high))
+        return out
+
+
+def _grid(kind: EffectType, problem: Problem, base: Fit) -> tuple[list[Point], dict[str, list[float]]]:
+    """All combinations of an effect's shapes, with periods that the residual shows, and the strengths by parameter."""
+    shapes, strengths = [], {}
+    for c, p in zip(effect_coordinates(kind), kind.parameters, strict=True):
+        if p.vanishing is None:
+            found = position_periods(problem, base, p.lower, p.upper) if p.period else ()
+            shapes.append([(c.name, c.z(v)) for v in (*(p.starts or (p.typical,)), *found)])
+        else:
+            low, high = c.bounds
+            points = [c.z(v) for v in p.starts] or [z for s in STRENGTHS for z in (s, -s)]
+            strengths[c.name] = [z for z in points if low <= z <= high]
+    return [dict(shape) for shape in itertools.product(*shapes)], strengths
+
+
+def farthest(found: Fit) -> float:
+    """How many standard deviations the nuisance parameters are from their nominal values at most."""
+    return max(
+        (abs(float(z)) for c, z in zip(found.coordinates, found.z, strict=True) if c.prior), default=0.0
+    )
+
+
+def point_key(base: Fit) -> bytes:
+    """What tells one fitted set of effects at one place from another."""
+    return repr([c.name for c in base.coordinates]).encode() + base.z.tobytes()
+
+
+def _point(found: Fit) -> Point:
+    return {c.name: float(z) for c, z in zip(found.coordinates, found.z, strict=True)}
