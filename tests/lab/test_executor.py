@@ -24,20 +24,27 @@ from hannes_lab.search import Search
 from hannes_lab.trials import make_trial
 from hannes_sim.effect import strength_of
 
+pytestmark = pytest.mark.xdist_group("executor")  # its fixtures take long: once, in one process
+
 ONLY = ["glove_stiffness", "wire_slack", "gravity"]
+QUICK = ("fast", "grasp_fast")
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("set")
-    made, truth = make_set(Model.load(), [strength_of("glove_stiffness", 1.0)], seed=401, closures=5)
+    made, truth = make_set(
+        Model.load(), [strength_of("glove_stiffness", 1.0)], seed=401, closures=5, conditions=QUICK
+    )
     write_set(made, truth, folder / "bags", folder / "truth.yaml")
     return folder / "bags"
 
 
 @pytest.fixture(scope="module")
 def prepared() -> Prepared:
-    made, _ = make_set(Model.load(), [strength_of("glove_stiffness", 1.0)], seed=401, closures=5)
+    made, _ = make_set(
+        Model.load(), [strength_of("glove_stiffness", 1.0)], seed=401, closures=5, conditions=QUICK
+    )
     return prepare([make_trial(r) for r in made], Model.load())
 
 
