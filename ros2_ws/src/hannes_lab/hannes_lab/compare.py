@@ -207,15 +207,14 @@ def _cells(
             own = label == k
             if own.sum() < 3:
                 continue
-            repeat = (
-                float(np.sqrt((e[:, own] ** 2).sum() / max(1, (n - 1) * own.sum())))
-                if n > 1
-                else float("nan")
-            )
+            scatter = float(np.sqrt((e[:, own] ** 2).sum() / max(1, (n - 1) * own.sum())))
+            repeat = max(scatter, block.resolution) if n > 1 else float("nan")
             rmse = float(np.sqrt(((block.measured - model)[:, own] ** 2).mean()))
             seen = float((residual[own] ** 2).mean())
             p = float("nan")
-            if n >= 5:
+            if n >= 5 and seen <= block.resolution**2:
+                p = 1.0
+            elif n >= 5:
                 # Means of randomly signed deviations: what the mean residual would be by scatter alone.
                 draws = rng.choice([-1.0, 1.0], size=(DRAWS, n)) @ e[:, own] / n * np.sqrt(n / (n - 1.0))
                 p = float((1 + ((draws**2).mean(axis=1) >= seen).sum()) / (1 + DRAWS))

@@ -327,7 +327,7 @@ def _grow(search: Search, null: Candidate, limits: Chance, max_effects: int) -> 
         )
     grown = grow(search, null, max_effects, WORTHWHILE)
     adequate = _adequate(search, grown.best, limits)
-    ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in grown.first)
+    ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits.median)) for c in grown.first)
     notes = list(grown.notes)
     if not adequate:
         notes.append(
@@ -360,12 +360,14 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         round_ = _extended(choice.search, front, texts[size - 1], worth)
         if not round_:
             break
-        ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, limits)) for c in round_)
         if enough and round_[0].penalised < worth and set(choice.best.names) < set(round_[0].names):
             # The set without it may find its way further down from there; what is left is the gain.
             choice = replace(choice, best=choice.search.without(round_[0], choice.best.names))
         # What chance gains was found for effects of one free strength; further parameters pay their penalty.
         gain = choice.best.penalised + PENALTY - round_[0].penalised
+        # Within chance there is nothing to explain, unless an effect gains more than chance does.
+        whole = round_[0].fit.cost if enough and gain >= needed else limits.median
+        ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, whole)) for c in round_)
         if gain < needed:
             choice = replace(choice, ranking=ranking)
             break
@@ -469,9 +471,9 @@ def _worth_showing(
     return search.found[tuple(sorted(names))], falls[: keep + 1]
 
 
-def _share(null: Candidate, candidate: Candidate, limits: Chance) -> float:
-    """Part of the excess misfit that the candidate removes, 0..1."""
-    excess = null.fit.cost - limits.median
+def _share(null: Candidate, candidate: Candidate, least: float) -> float:
+    """Part of the misfit above a complete model's that the candidate removes, 0..1."""
+    excess = null.fit.cost - least
     return float(np.clip((null.fit.cost - candidate.fit.cost) / excess, 0.0, 1.0)) if excess > 0 else 0.0
 
 

@@ -3,13 +3,13 @@
 A feature vector is linear in the signals, and the same for measurement and simulation: each closure is sampled at the
 measured instants, interpolated onto a phase grid, and combined over the closures.  The simulation of a model without
 memory repeats itself from the second closure of a condition on, so only two closures are simulated and the rest is
-taken from the second.
+taken from the second.  Recordings that each begin anew repeat the first of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,8 @@ class Block:
     phase      (p,) s since the closure's start
     measured   (n, p) the closures on the phase grid
     before, after, weight   (n, p) samples [ticks of the simulation] and interpolation weight of each point
-    compact    the same three for a simulation of the first two closures only; None where that does not hold
+    compact    the same three for a simulation of the closures only that others repeat; None where that does not hold
+    resolution  what a replay can tell at best, in the signal's unit (see Rig.floor)
     """
 
     trial: int
@@ -51,6 +52,7 @@ class Block:
     full: tuple[Index, Index, Array]
     compact: tuple[Index, Index, Array] | None
     unit: str = ""
+    resolution: float = 0.0
 
     @property
     def n(self) -> int:
@@ -120,7 +122,7 @@ class Features:
         memory = has_memory(model)
         runs: list[tuple[Mapping[str, Array], bool]] = []
         for trial, end in zip(self.trials, self.ends, strict=True):
-            compact = end is not None and not memory
+            compact = end is not None and (trial.fresh or not memory)
             reference = trial.reference[:end] if compact else trial.reference
             signals = rig.simulate(model, values, trial, reference)
             runs.append((signals, compact and not _whole(signals, trial)))
@@ -144,9 +146,12 @@ def has_memory(model: Model) -> bool:
     return any(load_effect(effect.source or effect.name).memory for effect in model.effects)
 
 
-def build_features(trials: Sequence[Trial], signals: Sequence[str], points: int = MAX_PHASES) -> Features:
+def build_features(
+    trials: Sequence[Trial], signals: Sequence[str], points: int = MAX_PHASES, floor: float = 0.0
+) -> Features:
     """The operator for these trials and signals, with at most `points` phases to a closure.
 
+    floor  what a replay can tell at best, in spans of the signal
     Raises HannesError where no trial has any of the signals.
     """
     blocks: list[Block] = []
@@ -159,7 +164,8 @@ def build_features(trials: Sequence[Trial], signals: Sequence[str], points: int 
                 if signal in trial.signals:
                     block = _block(trial, number, condition, signal, end is not None, points)
                     if block is not None:
-                        blocks.append(block)
+                        span = float(np.ptp(block.measured))
+                        blocks.append(replace(block, resolution=floor * span))
     if not blocks:
         raise HannesError(
             f"None of the signals {', '.join(signals)} covers a whole closure in these recordings."
@@ -168,21 +174,22 @@ def build_features(trials: Sequence[Trial], signals: Sequence[str], points: int 
 
 
 def compact_end(trial: Trial) -> int | None:
-    """Ticks up to the end of the second closure, if all closures of the trial have the same reference."""
-    if len(trial.conditions) != 1 or len(trial.closures) < 3:
+    """Ticks up to the end of the last closure that others repeat, if all closures have the same reference."""
+    repeats = trial.repeats
+    if len(trial.conditions) != 1 or len(trial.closures) <= len(set(repeats)):
         return None
-    second = trial.closures[1]
-    n = round((second.stop - second.start) / trial.period)
-    a = round(second.start / trial.period)
-    shape = trial.reference[a : a + n]
-    span = float(np.ptp(shape)) or 1.0
-    for closure in trial.closures[2:]:
-        k = _same_place(trial, closure, second)
+    for closure, number in zip(trial.closures, repeats, strict=True):
+        like = trial.closures[number]
+        n = round(min(c.stop - c.start for c in (like, closure)) / trial.period)
+        a = round(like.start / trial.period)
+        shape = trial.reference[a : a + n]
+        span = float(np.ptp(shape)) or 1.0
+        k = _same_place(trial, closure, like)
         other = trial.reference[k : k + n]
         # A fresh reference sample may fall one tick earlier or later from closure to closure.
         if other.size < n or np.mean(np.abs(other - shape)) > 2e-3 * span:
             return None
-    return min(trial.reference.size, round(second.stop / trial.period) + 60)
+    return min(trial.reference.size, round(trial.closures[max(repeats)].stop / trial.period) + 60)
 
 
 def _same_place(trial: Trial, closure: Closure, like: Closure) -> int:
@@ -217,9 +224,10 @@ def _block(
     full: list[tuple[Index, Index, Array]] = []
     compact: list[tuple[Index, Index, Array]] = []
     measured = []
-    base = trial.closures[1] if may_compact else None
     limit = compact_end(trial) if may_compact else None
-    for closure in closures:
+    # Where a simulation may be compact, all closures are of one condition.
+    bases = [trial.closures[k] for k in trial.repeats] if limit is not None else closures
+    for closure, base in zip(closures, bases, strict=True):
         at = closure.start + phase
         right = np.searchsorted(time, at)
         if right[0] == 0 or right[-1] >= time.size:
@@ -231,12 +239,8 @@ def _block(
         weight = np.clip((at - time[left]) / np.maximum(time[right] - time[left], 1e-12), 0.0, 1.0)
         measured.append(values[left] * (1.0 - weight) + values[right] * weight)
         full.append((sample_tick[left], sample_tick[right], weight))
-        if base is not None and limit is not None:
-            shift = (
-                0
-                if closure is trial.closures[0]
-                else round(base.start / trial.period) - _same_place(trial, closure, base)
-            )
+        if limit is not None:
+            shift = round(base.start / trial.period) - _same_place(trial, closure, base)
             compact.append(
                 (
                     np.clip(sample_tick[left] + shift, 0, limit - 1),
@@ -264,12 +268,12 @@ def _block(
 
 
 def data_used(features: Features) -> tuple[dict[str, Any], ...]:
-    """What data took part: bag, hash, conditions, closures, signals."""
+    """What data took part: per trial its conditions, closures and signals, and of which bags, by their hash, it is."""
     return tuple(
         {
             "name": t.name,
-            "source": t.source,
-            "sha256": t.sha256,
+            "source": ", ".join(p.source for p in t.parts) or t.source,
+            "sha256": ", ".join(p.sha256 for p in t.parts) or t.sha256,
             "conditions": list(t.conditions),
             "closures": len(t.closures),
             "signals": sorted(t.signals),

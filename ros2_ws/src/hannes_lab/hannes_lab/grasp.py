@@ -15,6 +15,8 @@ from hannes_description.model import Model
 from hannes_sim.objects import GraspObject
 from numpy.typing import NDArray
 
+from .hand import HandRig
+from .surrogate import FAST_PLANT
 from .trials import Trial
 
 Array = NDArray[np.float64]
@@ -38,7 +40,7 @@ def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
     """The trials, with an object of roughly seen stiffness and place where nobody said what was grasped.
 
     A kind that was named (soft, rigid) without a description of the recording says that there is an object, not how
-    stiff this one is: it gets the seen values too, where it is seen.
+    stiff this one is: it gets the seen values too, where it is seen and the nominal hand comes nearer with them.
     """
     curves = [closing_curve(trial, model) for trial in trials]
     out = []
@@ -55,6 +57,9 @@ def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
         stiffness, place = seen
         travel, opening = (model.parameters.value(f"hand.{n}") for n in ("fingertip_travel", "opening"))
         grasp = GraspObject(size=max(opening - place * travel, 1e-3), stiffness=stiffness / travel**2)
+        if given and _error(trial, model) <= _error(_with_object(trial, grasp), model):
+            out.append(trial)
+            continue
         said = (
             "its stiffness and place are"
             if given
@@ -64,9 +69,26 @@ def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
             f"{said} read from the closures (about {grasp.stiffness:.2g} N/m from {place:.1f} rad on) and fitted; say "
             f"--object {trial.name}=none if nothing was"
         )
-        options = {**trial.options, "object": grasp.to_dict(), "object_seen": True}
-        out.append(replace(trial, options=options, notes=(*trial.notes, note)))
+        out.append(replace(_with_object(trial, grasp), notes=(*trial.notes, note)))
     return out
+
+
+def _with_object(trial: Trial, grasp: GraspObject) -> Trial:
+    return replace(trial, options={**trial.options, "object": grasp.to_dict(), "object_seen": True})
+
+
+def _error(trial: Trial, model: Model) -> float:
+    """By how much the nominal hand, in its fast plant, misses the first closure: sum over the signals, in spans."""
+    first = trial.closures[0]
+    reference = trial.reference[: round(first.stop / trial.period)]
+    run = HandRig([trial]).simulate(model.with_plant(FAST_PLANT), {}, trial, reference)
+    total = 0.0
+    for name, (time, values) in trial.signals.items():
+        inside = (time >= first.start) & (time < first.stop)
+        ticks = np.minimum((time[inside] / trial.period).astype(int), reference.size - 1)
+        e = values[inside] - run[name][ticks]
+        total += float(np.sqrt(np.mean(e**2))) / (float(np.ptp(values[inside])) or 1.0)
+    return total
 
 
 def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:

@@ -149,9 +149,7 @@ def _record(
     base = {name: plant.get(name) for name in table if not name.startswith("object.") or spec.grasp != "none"}
     zero = hand.get("encoder.zero", 0.0)
     reference = spec.reference(controller.period, sensors.reference_rate)
-    parts: list[Rollout] = [
-        rollout(plant, controller, np.zeros(round(REST / controller.period)), joints=False)
-    ]
+    parts: list[Rollout] = []
     for _ in range(closures):
         for name, value in base.items():
             entry = table[name]
@@ -160,6 +158,9 @@ def _record(
                 plant.set(name, zero + scatter * float(entry["closure_sd"]) * rng.standard_normal())
             else:
                 plant.set(name, value * math.exp(shift) if entry["unit"] == "1" else value + shift)
+        if not parts:
+            rest = np.zeros(round(REST / controller.period))
+            parts.append(rollout(plant, controller, rest, joints=False))
         parts.append(rollout(plant, controller, reference, reset=False, joints=False))
     run = Rollout(
         np.concatenate([p.time for p in parts]),

@@ -16,11 +16,12 @@ from .features import Features, build_features
 from .fit import fit
 from .grasp import with_seen_objects
 from .hand import HandRig
+from .join import Loaded, join_repeats
 from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig
 from .settle import settle
 from .surrogate import rig_for
-from .trials import SIGNALS, Closure, Trial, make_trial, unique_names
+from .trials import SIGNALS, Closure, NoClosure, Trial, make_trial, unique_names
 
 OUTLIER = 6.0
 """A closure whose distance from the median closure exceeds this multiple of the median distance is left out."""
@@ -72,13 +73,27 @@ def _storage(path: Path) -> list[Path]:
 def load_trials(
     paths: Sequence[str | Path], signals: Sequence[str] = SIGNALS, scale: Mapping[str, float] | None = None
 ) -> list[Trial]:
-    """Trials of all bags below the paths; names are made unique. `scale`: factors to SI by signal name."""
-    trials = []
+    """Trials of all bags below the paths; names are made unique. `scale`: factors to SI by signal name.
+
+    Bags of a few closures each that repeat one condition become one trial (join.py).
+    """
+    loaded, empty = [], list[NoClosure]()
     for bag in find_bags(paths):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the reader's warnings are kept in the trial's notes
-            trials.append(make_trial(read_bag(bag), signals=signals, scale=scale))
-    return unique_names(trials)
+            recording = read_bag(bag)
+        try:
+            trial = make_trial(recording, signals=signals, scale=scale)
+        except NoClosure as none:
+            empty.append(none)
+            continue
+        condition = recording.metadata.get("condition")
+        step = recording["reference_position"].period
+        loaded.append(Loaded(trial, None if condition is None else str(condition), step))
+    if not loaded:
+        raise empty[0]
+    first, *others = unique_names(join_repeats(loaded))
+    return [replace(first, notes=(*first.notes, *(f"left out: {none}" for none in empty))), *others]
 
 
 def without_outliers(trial: Trial) -> Trial:
@@ -134,10 +149,8 @@ def prepare(
     unknown = [s for s in signals or () if s not in present]
     if unknown:
         there = dict.fromkeys(s for t in trials for s in t.signals)
-        raise HannesError(
-            f"No recording has the signal {', '.join(unknown)}; they have {', '.join(there)}."
-        )
-    features = build_features(trials, present, rig.points)
+        raise HannesError(f"No recording has the signal {', '.join(unknown)}; they have {', '.join(there)}.")
+    features = build_features(trials, present, rig.points, rig.floor)
     nuisances = tuple(rig.nuisances(model))
     coordinates = [nuisance_coordinate(n) for n in nuisances]
     view = rig_for(rig, model, coordinates, threads) if surrogate else rig

@@ -245,7 +245,7 @@ class PlantRig:
         else:
             self._came_back = True
             signals = self.observed(model, values, trial, reference)
-            if not self._came_back and reference.size < trial.reference.size:
+            if not (self._came_back or trial.fresh) and reference.size < trial.reference.size:
                 signals = self.observed(model, values, trial, trial.reference)
             self._signals[key] = signals
             if len(self._signals) > REMEMBERED:

@@ -227,15 +227,15 @@ class _Slope:
 
 
 def repeated(known: Array, trial: Trial, size: int) -> Array:
-    """Signals (k, size) of a simulation from one of the first two closures (k, ticks): the others repeat the second."""
+    """Signals (k, size) of a simulation from its begin (k, ticks), which holds all closures that others repeat."""
     if known.shape[1] >= size:
         return known[:, :size]
     index = np.arange(size)
     starts = [round(c.start / trial.period) for c in trial.closures]
-    if len(starts) > 2:
-        late = index[known.shape[1] :] - starts[1]
-        index[known.shape[1] :] = starts[1] + late % round(float(np.median(np.diff(starts))))
-    return known[:, np.minimum(index, known.shape[1] - 1)]
+    for start, stop, like in zip(starts, [*starts[1:], size], trial.repeats, strict=True):
+        if stop > known.shape[1]:
+            index[max(start, 0) : stop] = starts[like] + np.arange(stop - max(start, 0))
+    return known[:, np.clip(index, 0, known.shape[1] - 1)]
 
 
 def rig_for(rig: Rig, model: Model, coordinates: Sequence[Coordinate], threads: int = 1) -> Rig:

@@ -43,6 +43,10 @@ LONGEST_GAP = 5.0
 """Steps of a signal without a sample that are bridged by interpolation."""
 
 
+class NoClosure(HannesError):
+    """A recording without a whole closure."""
+
+
 @dataclass(frozen=True)
 class Closure:
     """One repetition: start and stop [s] in the trial's time, and the condition that it repeats."""
@@ -53,13 +57,25 @@ class Closure:
 
 
 @dataclass(frozen=True)
+class Part:
+    """One of the recordings that a trial is joined of: its name, file and hash, and where it begins [s]."""
+
+    name: str
+    source: str
+    sha256: str
+    begin: float
+
+
+@dataclass(frozen=True)
 class Trial:
-    """One recording, ready to be replayed.
+    """One recording, ready to be replayed; or a few that repeat one condition, one after the other.
 
     reference  (n,) on the control grid: reference[k] acts from k x period on
     signals    name -> (time (m,) s, values (m,))
     options    what the plant must know of this recording (object, sensors, pose); the rig's adapter reads it
     units      units of signals whose unit is not that of UNITS
+    parts      the recordings that it is joined of; empty if it is one
+    fresh      each part begins as the first does, whatever came before; else one goes on where another ended
     """
 
     name: str
@@ -72,12 +88,14 @@ class Trial:
     sha256: str = ""
     notes: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    parts: tuple[Part, ...] = ()
+    fresh: bool = False
 
     def __post_init__(self) -> None:
         if self.reference.ndim != 1 or self.reference.size < 2:
             raise HannesError(f"Trial '{self.name}': the reference is too short to be replayed.")
         if not self.closures:
-            raise HannesError(
+            raise NoClosure(
                 f"Trial '{self.name}': no closure was found: the reference never leaves its rest value "
                 "and comes back. Record at least one whole closure."
             )
@@ -92,6 +110,16 @@ class Trial:
 
     def of(self, condition: str) -> tuple[Closure, ...]:
         return tuple(closure for closure in self.closures if closure.condition == condition)
+
+    @property
+    def repeats(self) -> tuple[int, ...]:
+        """For each closure the number of the one that it repeats, for a machine without memory."""
+        if not self.fresh:
+            return tuple(min(k, 1) for k in range(len(self.closures)))
+        begins = [part.begin for part in self.parts]
+        where = np.searchsorted(begins, [0.5 * (c.start + c.stop) for c in self.closures], side="right")
+        most = int(np.sum(where == where[0])) - 1
+        return tuple(min(int(np.sum(where[:k] == here)), most) for k, here in enumerate(where))
 
     def only(self, closures: Sequence[Closure]) -> Trial:
         """The same recording with a part of its closures."""
@@ -298,7 +326,7 @@ def make_trial(
     cut = len(spans) - len(closures) - (len(inside) - len(whole))
     if cut:
         notes.append(f"{cut} of {len(spans)} closures are cut off and left out")
-    options = {key: meta[key] for key in ("object", "sensors", "plant", "pose", "encoder_session") if key in meta}
+    options = {key: meta[key] for key in ("object", "sensors", "plant", "pose") if key in meta}
     return Trial(
         name,
         period,

@@ -1,0 +1,192 @@
+"""Recordings of a few closures each that repeat one condition, joined into one: only repeats tell what is scatter."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from .features import compact_end
+from .trials import Part, Trial, group_closures
+
+Array = NDArray[np.float64]
+
+ENOUGH = 5
+"""Closures with which a recording tells its scatter itself; it stays alone, with its own encoder zero and delays."""
+
+ALIKE = 0.15
+"""Root mean square difference of two mean closures, in spans of the larger, up to which they may repeat each other:
+another object or speed differs by more, the scatter of a hand by less."""
+
+CHANCE = 1e-3
+LARGE = 1e-3
+"""Recordings begin anew where the encoder's rest moves over them with no more than this chance of it being scatter, and
+by more than this part of its span."""
+
+_GRID = 200
+_REST = 0.1  # s over which a rest position is averaged
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A trial with what its recording says beside it.
+
+    condition   name of the condition if the recording gives one
+    step        s between two samples of the logged reference
+    """
+
+    trial: Trial
+    condition: str | None = None
+    step: float = 0.0
+
+    @property
+    def kind(self) -> str:
+        """What repeats have in common: the condition's name, or the file's without its number or date."""
+        return self.condition or re.sub(r"[\d\W_]+", "", self.trial.name)
+
+
+def join_repeats(loaded: Sequence[Loaded]) -> list[Trial]:
+    """The trials in their order, those that repeat the condition of an earlier one joined to it.
+
+    Recordings are joined where each has fewer than ENOUGH closures, all of one condition, and they have the same kind,
+    signals, units and description (object, logger, pose), the same reference, and mean closures that are ALIKE.
+    """
+    groups: list[list[Loaded]] = []
+    for one in loaded:
+        group = next((g for g in groups if _repeats(one, g[0])), None)
+        if group is None:
+            groups.append([one])
+        else:
+            group.append(one)
+    fresh = _fresh([[one.trial for one in group] for group in groups if len(group) > 1])
+    return [trial for group in groups for trial in _one_or_all(group, fresh)]
+
+
+def _one_or_all(group: list[Loaded], fresh: bool) -> list[Trial]:
+    trials = [one.trial for one in group]
+    if len(group) == 1:
+        return trials
+    if not fresh:
+        return [_joined(group)]
+    first = _typical(trials)
+    joined = _joined([group[first], *group[:first], *group[first + 1 :]], fresh=True)
+    # Where the references do not match tick by tick, a simulation would go through them as if they were one.
+    return [joined] if compact_end(joined) is not None else trials
+
+
+def _fresh(groups: Sequence[Sequence[Trial]]) -> bool:
+    """Whether the machine did not begin each recording where a closure left it: a simulator that is started anew.
+
+    The encoder's rest after the closures of a recording less that before them, Student's t of its mean over a group.
+    """
+    moved: list[Array] = []
+    large: list[float] = []
+    for trials in groups:
+        if "encoder_position" in trials[0].signals:
+            shifts = np.array([_shift(trial) for trial in trials])
+            moved.append(shifts[np.isfinite(shifts)])
+            spans = [float(np.ptp(trial.signals["encoder_position"][1])) for trial in trials]
+            large.append(LARGE * float(np.mean(spans)))
+    freedom = sum(max(m.size - 1, 0) for m in moved)
+    if not freedom:
+        return False
+    sd = np.sqrt(sum(float(((m - m.mean()) ** 2).sum()) for m in moved if m.size) / freedom)
+    limit = float(stdtrit(freedom, 1.0 - 0.5 * CHANCE))
+    return any(
+        m.size > 0 and abs(m.mean()) > max(least, limit * sd / m.size**0.5)
+        for m, least in zip(moved, large, strict=True)
+    )
+
+
+def _shift(trial: Trial) -> float:
+    """Encoder's rest after the closures less that before them; NaN where the recording ends before it rests."""
+    time, position = trial.signals["encoder_position"]
+    ends = []
+    for at in (trial.closures[0].start, trial.closures[-1].stop):
+        stop = int(np.searchsorted(time, at)) + 1
+        start = min(int(np.searchsorted(time, at - _REST)), stop - 1, time.size - 1)
+        ends.append(position[start:stop])
+    half = ends[1].size // 2
+    drift = float(ends[1][half:].mean() - ends[1][:half].mean()) if half else 0.0
+    rests = abs(drift) <= LARGE * float(np.ptp(position))
+    return float(ends[1].mean() - ends[0].mean()) if rests else float("nan")
+
+
+def _typical(trials: Sequence[Trial]) -> int:
+    """Number of the trial with the most closures whose mean closure is nearest to the median of all."""
+    length = min(c.stop - c.start for t in trials for c in t.closures)
+    phase = np.linspace(0.0, length, _GRID)
+    away = np.zeros(len(trials))
+    for signal in trials[0].signals:
+        curves = np.array([_mean(t, signal, phase) for t in trials])
+        away += np.sqrt(((curves - np.median(curves, axis=0)) ** 2).mean(axis=1)) / max(np.ptp(curves), 1e-12)
+    return min(range(len(trials)), key=lambda k: (-len(trials[k].closures), away[k]))
+
+
+def _repeats(one: Loaded, other: Loaded) -> bool:
+    a, b = one.trial, other.trial
+    if any(len(t.conditions) != 1 or len(t.closures) >= ENOUGH for t in (a, b)):
+        return False
+    said = (one.kind, a.period, a.options, a.units, set(a.signals))
+    if said != (other.kind, b.period, b.options, b.units, set(b.signals)):
+        return False
+    together = _joined([other, one])
+    return len(together.conditions) == 1 and all(_alike(a, b, signal) for signal in a.signals)
+
+
+def _alike(a: Trial, b: Trial, signal: str) -> bool:
+    if _noise(a, signal) and _noise(b, signal):
+        return True
+    length = min(c.stop - c.start for t in (a, b) for c in t.closures)
+    curves = [_mean(t, signal, np.linspace(0.0, length, _GRID)) for t in (a, b)]
+    span = max(float(np.ptp(curve)) for curve in curves)
+    return float(np.sqrt(np.mean((curves[0] - curves[1]) ** 2))) <= ALIKE * span
+
+
+def _noise(trial: Trial, signal: str) -> bool:
+    """Whether neighbouring samples have next to nothing in common: a force sensor that nothing touches."""
+    values = trial.signals[signal][1] - trial.signals[signal][1].mean()
+    return float(values[1:] @ values[:-1]) <= 0.5 * float(values @ values)
+
+
+def _mean(trial: Trial, signal: str, phase: Array) -> Array:
+    time, values = trial.signals[signal]
+    return np.asarray(np.mean([np.interp(c.start + phase, time, values) for c in trial.closures], axis=0))
+
+
+def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
+    """One trial: the recordings one after the other, as if there had been no time between them."""
+    trials = [one.trial for one in group]
+    first = trials[0]
+    begins = np.concatenate([[0], np.cumsum([t.reference.size for t in trials])[:-1]]) * first.period
+    reference = np.concatenate([t.reference for t in trials])
+    spans = [
+        (c.start + begin, c.stop + begin) for t, begin in zip(trials, begins, strict=True) for c in t.closures
+    ]
+    signals = {}
+    for name in first.signals:
+        inside = [t.signals[name][0] >= (0.0 if k else -np.inf) for k, t in enumerate(trials)]
+        time = [t.signals[name][0][i] + b for t, i, b in zip(trials, inside, begins, strict=True)]
+        values = [t.signals[name][1][i] for t, i in zip(trials, inside, strict=True)]
+        signals[name] = np.concatenate(time), np.concatenate(values)
+    step = max(one.step for one in group)
+    others = ", ".join(t.name for t in trials[1:] if t.name != first.name)
+    said = f"{len(trials)} recordings repeat one condition and are taken together"
+    return replace(
+        first,
+        reference=reference,
+        signals=signals,
+        closures=tuple(group_closures(reference, first.period, spans, first.name, step)),
+        notes=(
+            *dict.fromkeys(n for t in trials for n in t.notes),
+            f"{said} (with {others})" if others else said,
+        ),
+        parts=tuple(
+            Part(t.name, t.source, t.sha256, float(begin)) for t, begin in zip(trials, begins, strict=True)
+        ),
+        fresh=fresh,
+    )
