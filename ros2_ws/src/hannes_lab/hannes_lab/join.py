@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from .features import compact_end
-from .trials import Part, Trial, group_closures
+from .trials import Part, Trial, group_closures, stem_of
 
 Array = NDArray[np.float64]
 
@@ -174,7 +174,8 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
         values = [t.signals[name][1][i] for t, i in zip(trials, inside, strict=True)]
         signals[name] = np.concatenate(time), np.concatenate(values)
     step = max(one.step for one in group)
-    others = ", ".join(t.name for t in trials[1:] if t.name != first.name)
+    names = [stem_of(t.source) if t.source else t.name for t in trials]
+    others = ", ".join(name for name in names if name != first.name)
     said = f"{len(trials)} recordings repeat one condition and are taken together"
     return replace(
         first,
@@ -186,7 +187,8 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
             f"{said} (with {others})" if others else said,
         ),
         parts=tuple(
-            Part(t.name, t.source, t.sha256, float(begin)) for t, begin in zip(trials, begins, strict=True)
+            Part(name, t.source, t.sha256, float(begin))
+            for name, t, begin in zip(names, trials, begins, strict=True)
         ),
         fresh=fresh,
     )

@@ -293,7 +293,7 @@ def make_trial(
     # Units are said below, with what was done.
     notes = [w for w in recording.warnings if "which looks like" not in w]
     meta = recording.metadata
-    name = name or str(meta.get("condition") or _stem(recording.source))
+    name = name or str(meta.get("condition") or stem_of(recording.source))
     channel = recording["reference_position"]
     origin = float(channel.time[0])
     origin = math.floor(origin / period + 1e-6) * period
@@ -346,7 +346,8 @@ def _gap(time: Array, start: float, stop: float) -> bool:
     return not steps.size or float(steps.max()) > max(LONGEST_GAP * float(np.median(np.diff(time))), 0.05)
 
 
-def _stem(source: str) -> str:
+def stem_of(source: str) -> str:
+    """The name of a bag or file without its ending."""
     from pathlib import Path
 
     path = Path(source)
