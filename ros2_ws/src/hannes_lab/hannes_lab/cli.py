@@ -159,7 +159,7 @@ def _prepared(
         if len(said) > 1:
             raise HannesError(
                 f"--object gives {' and '.join(sorted(said))} for recordings that repeat one condition: "
-                f"{', '.join(sorted(names[t.name] & set(given)))}. Name those of another object's otherwise."
+                f"{', '.join(sorted(names[t.name] & set(given)))}. Give bags of different objects different names."
             )
         if said:
             trials[k] = replace(t, options={**t.options, "object": said.pop()})
