@@ -11,7 +11,8 @@ from hannes_bags.writing import write_recording
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
-from hannes_lab.features import compact_end
+from hannes_lab.errors import repeatability
+from hannes_lab.features import build_features, compact_end
 from hannes_lab.hide import make_set
 from hannes_lab.join import ENOUGH, Loaded, join_repeats
 from hannes_lab.prepare import load_trials, prepare
@@ -103,6 +104,15 @@ def test_several_closures_begun_anew_repeat_those_of_the_longest_recording() -> 
     (joined,) = join_repeats(loaded(parts))
     assert joined.fresh and len(joined.closures) == 6
     assert joined.repeats == (0, 1, 2, 0, 0, 1)
+
+
+def test_closures_that_are_the_same_bit_for_bit_are_known_to_a_part_of_their_span() -> None:
+    (once,) = make_set(Model.load(), [], seed=1, closures=1, conditions=["grasp_fast"], spread=0.0)[0]
+    features = build_features(join_repeats(loaded([once, once])), ["encoder_position"])
+    block = features.blocks[0]
+    assert block.n == 2 and repeatability(block) == pytest.approx(1e-5 * np.ptp(block.measured))
+    moved = replace(block, measured=block.measured + np.array([[0.0], [1e-6]]))
+    assert repeatability(moved) == pytest.approx(1e-6 / np.sqrt(2.0))
 
 
 def test_what_differs_stays_apart(whole: list[Recording]) -> None:

@@ -208,12 +208,12 @@ def _cells(
             if own.sum() < 3:
                 continue
             scatter = float(np.sqrt((e[:, own] ** 2).sum() / max(1, (n - 1) * own.sum())))
-            repeat = max(scatter, block.resolution) if n > 1 else float("nan")
+            repeat = max(scatter, block.floor) if n > 1 else float("nan")
             rmse = float(np.sqrt(((block.measured - model)[:, own] ** 2).mean()))
             seen = float((residual[own] ** 2).mean())
             p = float("nan")
-            if n >= 5 and seen <= block.resolution**2:
-                p = 1.0
+            if n >= 5 and block.floor > 0.0 and seen <= block.floor**2:
+                p = 1.0  # the same closures again and again, and the model as near as can be told
             elif n >= 5:
                 # Means of randomly signed deviations: what the mean residual would be by scatter alone.
                 draws = rng.choice([-1.0, 1.0], size=(DRAWS, n)) @ e[:, own] / n * np.sqrt(n / (n - 1.0))

@@ -39,14 +39,14 @@ class SignalError:
 def repeatability(block: Block) -> float:
     """Root mean square scatter of the closures of a block, in its unit; NaN for a single closure.
 
-    At least what a replay can tell: a machine (or a simulator) that repeats itself better is not known that well.
     The first of four or more closures is left out: it starts from another state than the others.
+    Closures that are the same bit for bit have Block.floor.
     """
-    closures = block.measured[1:] if block.n >= 4 else block.measured
+    closures = block.alike
     if closures.shape[0] < 2:
         return float("nan")
     e = closures - closures.mean(axis=0)
-    return max(float(np.sqrt((e**2).sum(axis=0).mean() / (closures.shape[0] - 1))), block.resolution)
+    return max(float(np.sqrt((e**2).sum(axis=0).mean() / (closures.shape[0] - 1))), block.floor)
 
 
 def signal_errors(

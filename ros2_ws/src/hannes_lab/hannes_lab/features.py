@@ -9,7 +9,7 @@ taken from the second.  Recordings that each begin anew repeat the first of them
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,11 @@ MAX_PHASES = 160
 
 MIN_CLOSURES_FOR_DRIFT = 4
 
+EXACT = 1e-9
+FINEST = 1e-5
+"""Of a signal's span.  Closures that differ by no more than the first are those of a simulator without noise, which
+repeats itself bit for bit; they are taken to be known by the second, as by a sensor of 17 bits."""
+
 MOST_SHIFT = 15
 """Ticks by which a closure may begin earlier or later than where its reference was seen to move."""
 
@@ -41,7 +46,6 @@ class Block:
     measured   (n, p) the closures on the phase grid
     before, after, weight   (n, p) samples [ticks of the simulation] and interpolation weight of each point
     compact    the same three for a simulation of the closures only that others repeat; None where that does not hold
-    resolution  what a replay can tell at best, in the signal's unit (see Rig.floor)
     """
 
     trial: int
@@ -52,11 +56,22 @@ class Block:
     full: tuple[Index, Index, Array]
     compact: tuple[Index, Index, Array] | None
     unit: str = ""
-    resolution: float = 0.0
 
     @property
     def n(self) -> int:
         return int(self.measured.shape[0])
+
+    @property
+    def alike(self) -> Array:
+        """The closures without the first of four or more, which starts from another state than the others."""
+        return self.measured[1:] if self.n >= 4 else self.measured
+
+    @property
+    def floor(self) -> float:
+        """Scatter that is assumed of closures that are all the same, in the signal's unit; 0 of others."""
+        span = float(np.ptp(self.measured))
+        same = self.n > 1 and float(np.ptp(self.alike, axis=0).max()) <= EXACT * span
+        return FINEST * span if same else 0.0
 
     @property
     def size(self) -> int:
@@ -146,12 +161,9 @@ def has_memory(model: Model) -> bool:
     return any(load_effect(effect.source or effect.name).memory for effect in model.effects)
 
 
-def build_features(
-    trials: Sequence[Trial], signals: Sequence[str], points: int = MAX_PHASES, floor: float = 0.0
-) -> Features:
+def build_features(trials: Sequence[Trial], signals: Sequence[str], points: int = MAX_PHASES) -> Features:
     """The operator for these trials and signals, with at most `points` phases to a closure.
 
-    floor  what a replay can tell at best, in spans of the signal
     Raises HannesError where no trial has any of the signals.
     """
     blocks: list[Block] = []
@@ -164,8 +176,7 @@ def build_features(
                 if signal in trial.signals:
                     block = _block(trial, number, condition, signal, end is not None, points)
                     if block is not None:
-                        span = float(np.ptp(block.measured))
-                        blocks.append(replace(block, resolution=floor * span))
+                        blocks.append(block)
     if not blocks:
         raise HannesError(
             f"None of the signals {', '.join(signals)} covers a whole closure in these recordings."

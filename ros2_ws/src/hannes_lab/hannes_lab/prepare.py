@@ -150,7 +150,7 @@ def prepare(
     if unknown:
         there = dict.fromkeys(s for t in trials for s in t.signals)
         raise HannesError(f"No recording has the signal {', '.join(unknown)}; they have {', '.join(there)}.")
-    features = build_features(trials, present, rig.points, rig.floor)
+    features = build_features(trials, present, rig.points)
     nuisances = tuple(rig.nuisances(model))
     coordinates = [nuisance_coordinate(n) for n in nuisances]
     view = rig_for(rig, model, coordinates, threads) if surrogate else rig
