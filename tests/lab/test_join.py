@@ -138,7 +138,7 @@ def test_what_differs_stays_apart(whole: list[Recording]) -> None:
     assert len(join_repeats(loaded([alone, alone]))) == 2, "each tells its own scatter"
 
 
-def test_a_bag_without_a_whole_closure_is_left_out_with_a_note(
+def test_a_bag_without_a_whole_closure_or_given_twice_is_left_out_with_a_note(
     whole: list[Recording], tmp_path: Path
 ) -> None:
     one, two = cut(whole[0])[:2]
@@ -147,6 +147,8 @@ def test_a_bag_without_a_whole_closure_is_left_out_with_a_note(
     write_recording(two.slice(begin, begin + 0.6), tmp_path / "bags" / "a_2")
     (trial,) = load_trials([tmp_path / "bags"])
     assert "left out" in trial.notes[-1] and "no closure was found" in trial.notes[-1]
+    (trial,) = load_trials([tmp_path / "bags" / "a_1", tmp_path / "bags" / "a_1"])
+    assert "is the same recording as" in trial.notes[-1] and len(trial.closures) == 1
     with pytest.raises(HannesError, match="no closure was found"):
         load_trials([tmp_path / "bags" / "a_2"])
 

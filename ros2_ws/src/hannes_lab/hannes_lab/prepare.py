@@ -75,9 +75,12 @@ def load_trials(
 ) -> list[Trial]:
     """Trials of all bags below the paths; names are made unique. `scale`: factors to SI by signal name.
 
-    Bags of a few closures each that repeat one condition become one trial (join.py).
+    Bags of a few closures each that repeat one condition become one trial (join.py).  Bags without a whole closure, and
+    those that are there already, are left out with a note.
     """
-    loaded, empty = [], list[NoClosure]()
+    loaded: list[Loaded] = []
+    empty: list[NoClosure] = []
+    left_out: list[str] = []
     for bag in find_bags(paths):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the reader's warnings are kept in the trial's notes
@@ -86,6 +89,11 @@ def load_trials(
             trial = make_trial(recording, signals=signals, scale=scale)
         except NoClosure as none:
             empty.append(none)
+            left_out.append(str(none))
+            continue
+        twin = next((one.trial for one in loaded if one.trial.sha256 == trial.sha256 != ""), None)
+        if twin is not None:
+            left_out.append(f"'{bag}' is the same recording as '{twin.source}'")
             continue
         condition = recording.metadata.get("condition")
         step = recording["reference_position"].period
@@ -93,7 +101,7 @@ def load_trials(
     if not loaded:
         raise empty[0]
     first, *others = unique_names(join_repeats(loaded))
-    return [replace(first, notes=(*first.notes, *(f"left out: {none}" for none in empty))), *others]
+    return [replace(first, notes=(*first.notes, *(f"left out: {why}" for why in left_out))), *others]
 
 
 def without_outliers(trial: Trial) -> Trial:
