@@ -146,23 +146,16 @@ def _prepared(
     factors = _factors(scale)
     if machine and factors:
         raise HannesError("--scale is for bags; with --rig the adapter's reader says what the units are.")
-    trials = machine.read(bags) if machine else load_trials(bags, scale=factors)
-    names = {t.name: {t.name, *(part.name for part in t.parts)} for t in trials}
-    unknown = sorted(set(given).difference(*names.values()))
+    trials = machine.read(bags) if machine else load_trials(bags, scale=factors, objects=given)
+    unknown = sorted(set(given).difference(*({t.name, *(part.name for part in t.parts)} for t in trials)))
     if unknown:
         raise HannesError(
             f"--object names unknown conditions {', '.join(unknown)}; these bags have "
             f"{', '.join(t.name for t in trials)}."
         )
-    for k, t in enumerate(trials):
-        said = {given[name] for name in names[t.name] if name in given}
-        if len(said) > 1:
-            raise HannesError(
-                f"--object gives {' and '.join(sorted(said))} for recordings that repeat one condition: "
-                f"{', '.join(sorted(names[t.name] & set(given)))}. Give bags of different objects different names."
-            )
-        if said:
-            trials[k] = replace(t, options={**t.options, "object": said.pop()})
+    trials = [
+        replace(t, options={**t.options, "object": given[t.name]}) if t.name in given else t for t in trials
+    ]
     return prepare(trials, Model.load(model), rig=machine, signals=signals, surrogate=True, threads=threads)
 
 

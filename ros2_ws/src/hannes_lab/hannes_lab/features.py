@@ -191,14 +191,17 @@ def compact_end(trial: Trial) -> int | None:
         return None
     for closure, number in zip(trial.closures, repeats, strict=True):
         like = trial.closures[number]
+        if closure is like:
+            continue
         n = round(min(c.stop - c.start for c in (like, closure)) / trial.period)
         a = round(like.start / trial.period)
-        shape = trial.reference[a : a + n]
-        span = float(np.ptp(shape)) or 1.0
         k = _same_place(trial, closure, like)
-        other = trial.reference[k : k + n]
+        skip = max(0, -a, -k)  # a closure may begin a moment before the recording
+        shape = trial.reference[a + skip : a + n]
+        span = float(np.ptp(shape)) or 1.0
+        other = trial.reference[k + skip : k + n]
         # A fresh reference sample may fall one tick earlier or later from closure to closure.
-        if other.size < n or np.mean(np.abs(other - shape)) > 2e-3 * span:
+        if other.size < shape.size or np.mean(np.abs(other - shape)) > 2e-3 * span:
             return None
     return min(trial.reference.size, round(trial.closures[max(repeats)].stop / trial.period) + 60)
 
@@ -209,16 +212,18 @@ def _same_place(trial: Trial, closure: Closure, like: Closure) -> int:
     Where the logged reference is coarse, the closure's start is known to one of its steps; the whole curve says more.
     """
     a, k = round(like.start / trial.period), round(closure.start / trial.period)
-    n = round((like.stop - like.start) / trial.period)
-    shape = trial.reference[a : a + n]
+    skip = max(0, -a)
+    n = round((like.stop - like.start) / trial.period) - skip
+    shape = trial.reference[a + skip : a + skip + n]
 
     def apart(at: int) -> float:
         other = trial.reference[at : at + n]
         return float(np.mean(np.abs(other - shape[: other.size]))) if at >= 0 and other.size else np.inf
 
+    k += skip
     if apart(k) == 0.0:
-        return k
-    return min(range(k - MOST_SHIFT, k + MOST_SHIFT + 1), key=lambda at: (apart(at), abs(at - k)))
+        return k - skip
+    return min(range(k - MOST_SHIFT, k + MOST_SHIFT + 1), key=lambda at: (apart(at), abs(at - k))) - skip
 
 
 def _block(
@@ -251,7 +256,8 @@ def _block(
         measured.append(values[left] * (1.0 - weight) + values[right] * weight)
         full.append((sample_tick[left], sample_tick[right], weight))
         if limit is not None:
-            shift = round(base.start / trial.period) - _same_place(trial, closure, base)
+            here = round(base.start / trial.period)
+            shift = 0 if closure is base else here - _same_place(trial, closure, base)
             compact.append(
                 (
                     np.clip(sample_tick[left] + shift, 0, limit - 1),

@@ -7,12 +7,14 @@ so far, with the nominal hand's.  A glove or a tight spring is there in all reco
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from hannes_description.model import Model
 from hannes_sim.objects import GraspObject
+from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
 from .hand import HandRig
@@ -81,11 +83,14 @@ def _error(trial: Trial, model: Model) -> float:
     """By how much the nominal hand, in its fast plant, misses the first closure: sum over the signals, in spans."""
     first = trial.closures[0]
     reference = trial.reference[: round(first.stop / trial.period)]
-    run = HandRig([trial]).simulate(model.with_plant(FAST_PLANT), {}, trial, reference)
+    try:
+        run = HandRig([trial]).simulate(model.with_plant(FAST_PLANT), {}, trial, reference)
+    except PlantDiverged:
+        return math.inf
     total = 0.0
     for name, (time, values) in trial.signals.items():
         inside = (time >= first.start) & (time < first.stop)
-        ticks = np.minimum((time[inside] / trial.period).astype(int), reference.size - 1)
+        ticks = np.clip(np.floor(time[inside] / trial.period + 1e-4).astype(int), 0, reference.size - 1)
         e = values[inside] - run[name][ticks]
         total += float(np.sqrt(np.mean(e**2))) / (float(np.ptp(values[inside])) or 1.0)
     return total

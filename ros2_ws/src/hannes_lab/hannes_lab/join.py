@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 ENOUGH = 5
 """Closures with which a recording tells its scatter itself; it stays alone, with its own encoder zero and delays."""
 
-ALIKE = 0.15
+ALIKE = 0.1
 """Root mean square difference of two mean closures, in spans of the larger, up to which they may repeat each other:
 another object or speed differs by more, the scatter of a hand by less."""
 
@@ -45,8 +45,8 @@ class Loaded:
 
     @property
     def kind(self) -> str:
-        """What repeats have in common: the condition's name, or the file's without its number or date."""
-        return self.condition or re.sub(r"[\d\W_]+", "", self.trial.name)
+        """What repeats have in common: the condition's name, or the file's without the number or date at its end."""
+        return self.condition or re.sub(r"[\d\W_]+$", "", self.trial.name)
 
 
 def join_repeats(loaded: Sequence[Loaded]) -> list[Trial]:
@@ -57,7 +57,7 @@ def join_repeats(loaded: Sequence[Loaded]) -> list[Trial]:
     """
     groups: list[list[Loaded]] = []
     for one in loaded:
-        group = next((g for g in groups if _repeats(one, g[0])), None)
+        group = next((g for g in groups if _one_object([*g, one]) and _repeats(one, g[0])), None)
         if group is None:
             groups.append([one])
         else:
@@ -66,9 +66,9 @@ def join_repeats(loaded: Sequence[Loaded]) -> list[Trial]:
     return [trial for group in groups for trial in _one_or_all(group, fresh)]
 
 
-def _one_or_all(group: list[Loaded], fresh: bool) -> list[Trial]:
+def _one_or_all(group: list[Loaded], fresh: bool | None) -> list[Trial]:
     trials = [one.trial for one in group]
-    if len(group) == 1:
+    if len(group) == 1 or fresh is None:
         return trials
     if not fresh:
         return [_joined(group)]
@@ -78,10 +78,11 @@ def _one_or_all(group: list[Loaded], fresh: bool) -> list[Trial]:
     return [joined] if compact_end(joined) is not None else trials
 
 
-def _fresh(groups: Sequence[Sequence[Trial]]) -> bool:
+def _fresh(groups: Sequence[Sequence[Trial]]) -> bool | None:
     """Whether the machine did not begin each recording where a closure left it: a simulator that is started anew.
 
     The encoder's rest after the closures of a recording less that before them, Student's t of its mean over a group.
+    None where that cannot be told: no encoder, or recordings that end before the hand rests.
     """
     moved: list[Array] = []
     large: list[float] = []
@@ -93,7 +94,7 @@ def _fresh(groups: Sequence[Sequence[Trial]]) -> bool:
             large.append(LARGE * float(np.mean(spans)))
     freedom = sum(max(m.size - 1, 0) for m in moved)
     if not freedom:
-        return False
+        return None
     sd = np.sqrt(sum(float(((m - m.mean()) ** 2).sum()) for m in moved if m.size) / freedom)
     limit = float(stdtrit(freedom, 1.0 - 0.5 * CHANCE))
     return any(
@@ -127,12 +128,19 @@ def _typical(trials: Sequence[Trial]) -> int:
     return min(range(len(trials)), key=lambda k: (-len(trials[k].closures), away[k]))
 
 
+def _one_object(group: Sequence[Loaded]) -> bool:
+    """Whether nobody says that different objects were grasped."""
+    said = [one.trial.options["object"] for one in group if "object" in one.trial.options]
+    return all(one == said[0] for one in said)
+
+
 def _repeats(one: Loaded, other: Loaded) -> bool:
     a, b = one.trial, other.trial
     if any(len(t.conditions) != 1 or len(t.closures) >= ENOUGH for t in (a, b)):
         return False
-    said = (one.kind, a.period, a.options, a.units, set(a.signals))
-    if said != (other.kind, b.period, b.options, b.units, set(b.signals)):
+    options = [{k: v for k, v in t.options.items() if k != "object"} for t in (a, b)]
+    said = (one.kind, a.period, options[0], a.units, set(a.signals))
+    if said != (other.kind, b.period, options[1], b.units, set(b.signals)):
         return False
     together = _joined([other, one])
     return len(together.conditions) == 1 and all(_alike(a, b, signal) for signal in a.signals)
@@ -175,16 +183,19 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
         signals[name] = np.concatenate(time), np.concatenate(values)
     step = max(one.step for one in group)
     names = [stem_of(t.source) if t.source else t.name for t in trials]
-    others = ", ".join(name for name in names if name != first.name)
-    said = f"{len(trials)} recordings repeat one condition and are taken together"
+    said = f"{len(trials)} recordings repeat one condition and are taken together ({', '.join(names)})"
+    numbers = [number for t in trials for number in range(len(t.closures))]
+    closures = group_closures(reference, first.period, spans, first.name, step)
+    ordinals = {start: number for (start, _), number in zip(spans, numbers, strict=True)}
     return replace(
         first,
+        options={key: value for t in reversed(trials) for key, value in t.options.items()},
         reference=reference,
         signals=signals,
-        closures=tuple(group_closures(reference, first.period, spans, first.name, step)),
+        closures=tuple(replace(c, number=ordinals[c.start]) for c in closures),
         notes=(
             *dict.fromkeys(n for t in trials for n in t.notes),
-            f"{said} (with {others})" if others else said,
+            said,
         ),
         parts=tuple(
             Part(name, t.source, t.sha256, float(begin))

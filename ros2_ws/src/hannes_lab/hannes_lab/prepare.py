@@ -21,7 +21,7 @@ from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig
 from .settle import settle
 from .surrogate import rig_for
-from .trials import SIGNALS, Closure, NoClosure, Trial, make_trial, unique_names
+from .trials import SIGNALS, Closure, NoClosure, Trial, make_trial, stem_of, unique_names
 
 OUTLIER = 6.0
 """A closure whose distance from the median closure exceeds this multiple of the median distance is left out."""
@@ -71,10 +71,15 @@ def _storage(path: Path) -> list[Path]:
 
 
 def load_trials(
-    paths: Sequence[str | Path], signals: Sequence[str] = SIGNALS, scale: Mapping[str, float] | None = None
+    paths: Sequence[str | Path],
+    signals: Sequence[str] = SIGNALS,
+    scale: Mapping[str, float] | None = None,
+    objects: Mapping[str, str] | None = None,
 ) -> list[Trial]:
-    """Trials of all bags below the paths; names are made unique. `scale`: factors to SI by signal name.
+    """Trials of all bags below the paths; names are made unique.
 
+    scale    factors to SI by signal name
+    objects  what was grasped, by the name of the condition or of the bag
     Bags of a few closures each that repeat one condition become one trial (join.py).  Bags without a whole closure, and
     those that are there already, are left out with a note.
     """
@@ -89,17 +94,21 @@ def load_trials(
             trial = make_trial(recording, signals=signals, scale=scale)
         except NoClosure as none:
             empty.append(none)
-            left_out.append(str(none))
+            left_out.append(f"'{bag}': {none}")
             continue
         twin = next((one.trial for one in loaded if one.trial.sha256 == trial.sha256 != ""), None)
         if twin is not None:
             left_out.append(f"'{bag}' is the same recording as '{twin.source}'")
             continue
+        given = objects or {}
+        said = [given[name] for name in (stem_of(str(bag)), trial.name) if name in given]
+        if said:
+            trial = replace(trial, options={**trial.options, "object": said[0]})
         condition = recording.metadata.get("condition")
         step = recording["reference_position"].period
         loaded.append(Loaded(trial, None if condition is None else str(condition), step))
     if not loaded:
-        raise empty[0]
+        raise empty[0] if empty else HannesError("No bag was given.")
     first, *others = unique_names(join_repeats(loaded))
     return [replace(first, notes=(*first.notes, *(f"left out: {why}" for why in left_out))), *others]
 
@@ -123,7 +132,9 @@ def without_outliers(trial: Trial) -> Trial:
                 distance, away / max(float(np.median(away)), 1e-3 * float(np.ptp(curves)), 1e-12)
             )
         for closure, far in zip(closures, distance, strict=True):
-            (dropped if far > OUTLIER else kept).append(closure)
+            # What the others are simulated as stays: the most typical recording of those that begin anew.
+            needed = trial.fresh and closure.start < trial.parts[1].begin
+            (dropped if far > OUTLIER and not needed else kept).append(closure)
     if not dropped:
         return trial
     note = f"{len(dropped)} closure(s) far from the others are left out, starting at " + ", ".join(

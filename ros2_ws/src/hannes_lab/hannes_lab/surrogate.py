@@ -168,7 +168,8 @@ class AnchoredRig:
         return repeated(self._corrections[key], trial, size)
 
     def _shortest(self, trial: Trial, reference: Array) -> Array:
-        return reference if has_memory(self._model) else reference[: self._ends[trial.name]]
+        whole = has_memory(self._model) and not trial.fresh
+        return reference if whole else reference[: self._ends[trial.name]]
 
     def _learn(self, trial: Trial, reference: Array) -> None:
         """Take the correction of a trial, and those of the others: they are wanted next."""
@@ -222,7 +223,7 @@ class _Slope:
         return c.z(value) - (c.z(anchor[c.name]) if c.name in anchor else 0.0)
 
     def on(self, trial: Trial, size: int) -> Array:
-        """The derivative for a simulation of `size` ticks: later closures repeat the second."""
+        """The derivative for a simulation of `size` ticks: later closures repeat earlier ones."""
         return repeated(self.signals[trial.name], trial, size)
 
 

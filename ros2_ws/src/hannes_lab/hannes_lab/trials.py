@@ -49,11 +49,12 @@ class NoClosure(HannesError):
 
 @dataclass(frozen=True)
 class Closure:
-    """One repetition: start and stop [s] in the trial's time, and the condition that it repeats."""
+    """One repetition: start and stop [s] in the trial's time, its condition, and its number in its own recording."""
 
     start: float
     stop: float
     condition: str
+    number: int = 0
 
 
 @dataclass(frozen=True)
@@ -116,10 +117,10 @@ class Trial:
         """For each closure the number of the one that it repeats, for a machine without memory."""
         if not self.fresh:
             return tuple(min(k, 1) for k in range(len(self.closures)))
-        begins = [part.begin for part in self.parts]
-        where = np.searchsorted(begins, [0.5 * (c.start + c.stop) for c in self.closures], side="right")
-        most = int(np.sum(where == where[0])) - 1
-        return tuple(min(int(np.sum(where[:k] == here)), most) for k, here in enumerate(where))
+        # The first recording has the most closures; outliers may be missing.
+        until = self.parts[1].begin
+        base = {c.number: k for k, c in enumerate(self.closures) if 0.5 * (c.start + c.stop) < until}
+        return tuple(base.get(c.number, k) for k, c in enumerate(self.closures))
 
     def only(self, closures: Sequence[Closure]) -> Trial:
         """The same recording with a part of its closures."""
