@@ -174,7 +174,7 @@ def build_features(trials: Sequence[Trial], signals: Sequence[str], points: int 
         for condition in trial.conditions:
             for signal in signals:
                 if signal in trial.signals:
-                    block = _block(trial, number, condition, signal, end is not None, points)
+                    block = _block(trial, number, condition, signal, end, points)
                     if block is not None:
                         blocks.append(block)
     if not blocks:
@@ -227,7 +227,7 @@ def _same_place(trial: Trial, closure: Closure, like: Closure) -> int:
 
 
 def _block(
-    trial: Trial, number: int, condition: str, signal: str, may_compact: bool, most: int
+    trial: Trial, number: int, condition: str, signal: str, limit: int | None, most: int
 ) -> Block | None:
     time, values = trial.signals[signal]
     closures = trial.of(condition)
@@ -240,7 +240,6 @@ def _block(
     full: list[tuple[Index, Index, Array]] = []
     compact: list[tuple[Index, Index, Array]] = []
     measured = []
-    limit = compact_end(trial) if may_compact else None
     # Where a simulation may be compact, all closures are of one condition.
     bases = [trial.closures[k] for k in trial.repeats] if limit is not None else closures
     for closure, base in zip(closures, bases, strict=True):

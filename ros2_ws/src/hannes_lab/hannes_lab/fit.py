@@ -40,6 +40,11 @@ class Fit:
         return {c.name: c.value(float(z)) for c, z in zip(self.coordinates, self.z, strict=True)}
 
     @property
+    def point(self) -> dict[str, float]:
+        """z by name."""
+        return {c.name: float(z) for c, z in zip(self.coordinates, self.z, strict=True)}
+
+    @property
     def misfit(self) -> float:
         """Sum of squares of the whitened residual alone."""
         return float(self.residual @ self.residual)

@@ -106,9 +106,9 @@ def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:
     closures = trial.of(trial.conditions[0])
     length = min(c.stop - c.start for c in closures)
     phase = np.linspace(0.0, length, 400)
-    position = _mean(trial, "encoder_position", phase)
+    position = trial.mean_closure("encoder_position", phase)
     if "motor_current" in trial.signals:
-        current = _mean(trial, "motor_current", phase)
+        current = trial.mean_closure("motor_current", phase)
     else:
         kp, kd = (model.parameters.value(f"control.{n}") for n in ("kp", "damping"))
         ticks = np.arange(trial.reference.size) * trial.period
@@ -122,12 +122,6 @@ def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:
         return None
     q = np.maximum.accumulate(position[rising[0] : top + 1])
     return q, current[rising[0] : top + 1]
-
-
-def _mean(trial: Trial, signal: str, phase: Array) -> Array:
-    time, values = trial.signals[signal]
-    closures = trial.of(trial.conditions[0])
-    return np.asarray(np.mean([np.interp(c.start + phase, time, values) for c in closures], axis=0))
 
 
 def _nominal(model: Model) -> tuple[float, float, float]:

@@ -123,7 +123,7 @@ def _typical(trials: Sequence[Trial]) -> int:
     phase = np.linspace(0.0, length, _GRID)
     away = np.zeros(len(trials))
     for signal in trials[0].signals:
-        curves = np.array([_mean(t, signal, phase) for t in trials])
+        curves = np.array([t.mean_closure(signal, phase) for t in trials])
         away += np.sqrt(((curves - np.median(curves, axis=0)) ** 2).mean(axis=1)) / max(np.ptp(curves), 1e-12)
     return min(range(len(trials)), key=lambda k: (-len(trials[k].closures), away[k]))
 
@@ -150,7 +150,7 @@ def _alike(a: Trial, b: Trial, signal: str) -> bool:
     if _noise(a, signal) and _noise(b, signal):
         return True
     length = min(c.stop - c.start for t in (a, b) for c in t.closures)
-    curves = [_mean(t, signal, np.linspace(0.0, length, _GRID)) for t in (a, b)]
+    curves = [t.mean_closure(signal, np.linspace(0.0, length, _GRID)) for t in (a, b)]
     span = max(float(np.ptp(curve)) for curve in curves)
     return float(np.sqrt(np.mean((curves[0] - curves[1]) ** 2))) <= ALIKE * span
 
@@ -159,11 +159,6 @@ def _noise(trial: Trial, signal: str) -> bool:
     """Whether neighbouring samples have next to nothing in common: a force sensor that nothing touches."""
     values = trial.signals[signal][1] - trial.signals[signal][1].mean()
     return float(values[1:] @ values[:-1]) <= 0.5 * float(values @ values)
-
-
-def _mean(trial: Trial, signal: str, phase: Array) -> Array:
-    time, values = trial.signals[signal]
-    return np.asarray(np.mean([np.interp(c.start + phase, time, values) for c in trial.closures], axis=0))
 
 
 def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:

@@ -109,7 +109,7 @@ class Scan:
         """
         if all(c.prior for c in base.coordinates):
             return start
-        kept = {**start, **_point(base)}
+        kept = {**start, **base.point}
         problem, costs = seen_from(self.problem, base), []
         for one in (start, kept):
             r = problem.residual(model, {c.name: c.value(one.get(c.name, 0.0)) for c in coordinates})[
@@ -131,7 +131,7 @@ class _Place:
     ) -> None:
         self.place, self.model, self.coordinates = place, model, coordinates
         self.own = {c.name: c for c in effect_coordinates(kind)}
-        self.here, self.problem, self.use = _point(place), seen_from(scan.problem, place), scan.use
+        self.here, self.problem, self.use = place.point, seen_from(scan.problem, place), scan.use
 
     def scored(
         self, shapes: Sequence[Point], strengths: Mapping[str, Sequence[float]], *, last: bool
@@ -182,7 +182,7 @@ class _Place:
                 reach = max(REACH, abs(float(place.z[k])))
                 bounds[k] = max(-reach, bounds[k, 0]), min(reach, bounds[k, 1])
         moved = np.clip(z, bounds[:, 0], bounds[:, 1])
-        return cost, {**{c.name: float(v) for c, v in zip(place.coordinates, moved, strict=True)}, **start}
+        return cost, {**replace(place, z=moved).point, **start}
 
     def followed(self, derivative: Array) -> tuple[float, float]:
         """Least cost along one more direction, with the place's coordinates compensating, and how far along it."""
@@ -237,7 +237,3 @@ def farthest(found: Fit) -> float:
 def point_key(base: Fit) -> bytes:
     """What tells one fitted set of effects at one place from another."""
     return repr([c.name for c in base.coordinates]).encode() + base.z.tobytes()
-
-
-def _point(found: Fit) -> Point:
-    return {c.name: float(z) for c, z in zip(found.coordinates, found.z, strict=True)}

@@ -219,8 +219,7 @@ class Search:
         if best.cost > base.fit.cost:
             # The set contains the base: the search was led astray, and starts again from where the base is.
             strengths = {f"{name}.{p.name}" for p in self.effect(name).parameters if p.vanishing is not None}
-            here = {c.name: float(z) for c, z in zip(base.fit.coordinates, base.fit.z, strict=True)}
-            at = {**starts[0], **here, **dict.fromkeys(strengths, 0.0)}
+            at = {**starts[0], **base.fit.point, **dict.fromkeys(strengths, 0.0)}
             again = fit(
                 seen_from(self.problem, base.fit),
                 best.model,
@@ -341,9 +340,8 @@ class Search:
                 if name not in base.names:
                     todo.setdefault(tuple(sorted((*base.names, name))), (base, name))
         points = self.each(Search._at_nominal, [(base,) for base in bases], f"{text}: nominal values")
-        self._nominal = self.scan.nominal = {
-            point_key(base.fit): point for base, point in zip(bases, points, strict=True)
-        }
+        self._nominal.clear()
+        self._nominal.update((point_key(base.fit), point) for base, point in zip(bases, points, strict=True))
         scans = self.each(Search._scanned, list(todo.values()), f"{text}: scan")
         order = sorted(zip(todo.values(), scans, strict=True), key=lambda item: item[1][0][0])
         least = order[0][1][0][0] if order else np.inf

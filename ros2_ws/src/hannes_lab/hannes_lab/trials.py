@@ -122,6 +122,12 @@ class Trial:
         base = {c.number: k for k, c in enumerate(self.closures) if 0.5 * (c.start + c.stop) < until}
         return tuple(base.get(c.number, k) for k, c in enumerate(self.closures))
 
+    def mean_closure(self, signal: str, phase: Array) -> Array:
+        """Mean of a signal over the closures of the first condition at these times (p,) since their start [s]."""
+        time, values = self.signals[signal]
+        curves = [np.interp(c.start + phase, time, values) for c in self.of(self.conditions[0])]
+        return np.asarray(np.mean(curves, axis=0))
+
     def only(self, closures: Sequence[Closure]) -> Trial:
         """The same recording with a part of its closures."""
         return replace(self, closures=tuple(closures))
