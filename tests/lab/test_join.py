@@ -169,6 +169,21 @@ def test_recordings_that_begin_with_the_move_are_taken(whole: list[Recording]) -
     assert np.isfinite(prepare(joined, Model.load()).problem.residual(Model.load(), {})).all()
 
 
+def test_a_recording_that_ends_soon_after_the_move_shortens_the_closures_and_is_not_lost(
+    whole: list[Recording],
+) -> None:
+    parts = cut(whole[0])[:4]
+    reference = parts[1]["reference_position"]
+    moved = np.flatnonzero(np.abs(np.asarray(reference.values)) > 0.02)
+    until = float(reference.time[moved[-1]]) + 0.1
+    (joined,) = join_repeats(loaded([parts[0], parts[1].slice(float(reference.time[0]), until), *parts[2:]]))
+    lengths = np.array([c.stop - c.start for c in joined.closures])
+    assert lengths.size == 4 and np.ptp(lengths) < 1e-9
+    usual = loaded(parts[:1])[0].trial.closures[0]
+    assert lengths[0] < 0.8 * (usual.stop - usual.start)
+    assert f"the first {lengths[0]:.2f} s" in joined.notes[-1] and "ends early" in joined.notes[-1]
+
+
 def test_a_bag_without_a_whole_closure_or_given_twice_is_left_out_with_a_note(
     whole: list[Recording], tmp_path: Path
 ) -> None:

@@ -27,6 +27,9 @@ LARGE = 1e-3
 """Recordings begin anew where the encoder's rest moves over them with no more than this chance of it being scatter, and
 by more than this part of its span."""
 
+SHORT = 0.8
+"""Part of the usual length below which the shortest closure, to which all are cut, is spoken of."""
+
 _GRID = 200
 _REST = 0.1  # s over which a rest position is averaged
 
@@ -167,8 +170,12 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
     first = trials[0]
     begins = np.concatenate([[0], np.cumsum([t.reference.size for t in trials])[:-1]]) * first.period
     reference = np.concatenate([t.reference for t in trials])
+    # Recordings end sooner or later after the hand has come back; what all of them have is taken.
+    length, ends_first = min((c.stop - c.start, k) for k, t in enumerate(trials) for c in t.closures)
     spans = [
-        (c.start + begin, c.stop + begin) for t, begin in zip(trials, begins, strict=True) for c in t.closures
+        (c.start + begin, c.start + begin + length)
+        for t, begin in zip(trials, begins, strict=True)
+        for c in t.closures
     ]
     signals = {}
     for name in first.signals:
@@ -179,6 +186,9 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
     step = max(one.step for one in group)
     names = [stem_of(t.source) if t.source else t.name for t in trials]
     said = f"{len(trials)} recordings repeat one condition and are taken together ({', '.join(names)})"
+    usual = float(np.median([c.stop - c.start for t in trials for c in t.closures]))
+    if length < SHORT * usual:
+        said += f"; of each closure the first {length:.2f} s ({usual:.2f} s without {names[ends_first]}, which ends early)"
     numbers = [number for t in trials for number in range(len(t.closures))]
     closures = group_closures(reference, first.period, spans, first.name, step)
     ordinals = {start: number for (start, _), number in zip(spans, numbers, strict=True)}
