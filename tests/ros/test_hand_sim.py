@@ -64,6 +64,21 @@ def test_lockstep_reports_what_it_waits_for_and_ignores_commands_out_of_turn(pee
         assert status["tick"] == "0"
 
 
+def test_lockstep_repeats_the_reading_to_whom_was_found_too_late_for_the_current_alone(peer):
+    """A controller is found one topic after the other: here another hears motor/current before it does."""
+    peer.hear("encoder_position", "motor_current")
+    states = peer.heard["encoder_position"]
+    late: list[bytes] = []
+    with processes(NodeProcess("hand_sim", clock="lockstep")):
+        peer.publisher("motor_voltage")
+        peer.until(lambda: len(states) == 1, what="the first reading")
+        peer.hear("motor_current", callback=late.append)
+        peer.until(lambda: len(late) > 0, what="the reading again")
+        assert [convert.MOTOR_STATE.decode(data).stamp_ns for data in states[:2]] == [0, 0]
+        say_voltage(peer, 1.0)
+        peer.until(lambda: convert.MOTOR_STATE.decode(states[-1]).stamp_ns == 1_000_000, what="the loop going on")
+
+
 def test_real_time_gives_zero_volt_when_commands_stop(peer):
     peer.hear("encoder_position", "motor_current")
     peer.hear_diagnostics()

@@ -122,7 +122,7 @@ class StallWatch:
         self.stalled = False
 
     def newcomer(self) -> None:
-        """A new subscriber of the reading was matched."""
+        """A new subscriber of a part of the reading was matched."""
         self._newcomer = True
 
     def check(self, now: float) -> bool:

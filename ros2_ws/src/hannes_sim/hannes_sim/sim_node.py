@@ -93,7 +93,7 @@ class HandSim(HannesNode, Node):
 
         self._watch = StallWatch(p.command_timeout_ms / 1e3)
         self._state = topics.publisher(self, "encoder_position", self._on_match)
-        self._current = topics.publisher(self, "motor_current")
+        self._current = topics.publisher(self, "motor_current", self._on_match)
         self._joints = topics.publisher(self, "joint_positions")
         self._force = topics.publisher(self, "grip_force")
         self._last: tuple[bytes, bytes] = (b"", b"")
