@@ -188,7 +188,8 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
     said = f"{len(trials)} recordings repeat one condition and are taken together ({', '.join(names)})"
     usual = float(np.median([c.stop - c.start for t in trials for c in t.closures]))
     if length < SHORT * usual:
-        said += f"; of each closure the first {length:.2f} s ({usual:.2f} s without {names[ends_first]}, which ends early)"
+        without = f"{usual:.2f} s without {names[ends_first]}, which ends early"
+        said += f"; of each closure the first {length:.2f} s ({without})"
     numbers = [number for t in trials for number in range(len(t.closures))]
     closures = group_closures(reference, first.period, spans, first.name, step)
     ordinals = {start: number for (start, _), number in zip(spans, numbers, strict=True)}
