@@ -81,7 +81,7 @@ def test_nothing_is_missing_in_clean_data() -> None:
 @pytest.mark.parametrize(
     ("name", "seed", "conditions"),
     [
-        ("glove_stiffness", 102, DEFAULT_CONDITIONS),
+        ("glove_stiffness", 102, QUICK),
         ("gearbox_inertia", 103, QUICK),
         ("load_dependent_friction", 104, QUICK),
     ],
@@ -101,6 +101,11 @@ def test_a_hidden_effect_is_named_its_parameter_recovered_and_the_error_falls(
     held_out = [fall.held_out for fall in found.falls]
     assert held_out[-1] <= 1.3 < held_out[0]
     assert held_out[-1] < held_out[1], "more than the nuisance parameters must be gained"
+    content = found.to_dict()
+    assert set(content) >= {"verdict", "effects", "tied", "experiments", "error", "falls", "depends_on"}
+    assert set(content["error"]) >= {"nominal", "final", "repeatability", "held_out"}
+    assert set(content["effects"][0]["parameters"][p]) >= {"value", "low", "high", "unit"}
+    assert set(content["falls"][0]) >= {"added", "train", "held_out"}
 
 
 def test_friction_within_reach_of_the_tolerance_is_no_effect_but_is_pointed_at() -> None:
@@ -191,7 +196,7 @@ def test_one_closure_is_said_to_hold_nothing_out() -> None:
 def test_an_effect_outside_the_catalogue_is_called_unknown(tmp_path: Path) -> None:
     file = tmp_path / "latch.py"
     file.write_text(OUTSIDE)
-    prepared, _ = data([f"{file}:Flap"], seed=105, conditions=QUICK)
+    prepared, _ = data([f"{file}:Flap"], seed=105, conditions=QUICK[1:])
     found = diagnose(prepared, effect_sources(model=prepared.model), max_effects=2)
     assert found.verdict == "unknown"
     assert "not in the catalogue" in found.summary
@@ -229,18 +234,8 @@ def test_add_writes_a_model_whose_error_is_low_as_given(tmp_path: Path) -> None:
     assert sum(c.fails for c in before.cells) > sum(c.fails for c in after.cells)
 
 
-def test_results_do_not_depend_on_the_number_of_processes() -> None:
-    prepared, _ = data(["wire_elasticity"], 107)
-    only = ["wire_elasticity", "gravity"]
-    one = diagnose(prepared, effect_sources(only=only), jobs=1)
-    two = diagnose(prepare(prepared.features.trials, prepared.model), effect_sources(only=only), jobs=2)
-    assert [r.names for r in one.ranking] == [r.names for r in two.ranking]
-    assert [r.cost for r in one.ranking] == [r.cost for r in two.ranking]
-    assert one.falls[-1].held_out == two.falls[-1].held_out
-
-
 def test_position_alone_works_and_says_what_is_lost() -> None:
-    prepared, _ = data(["glove_stiffness"], 108)
+    prepared, _ = data(["glove_stiffness"], 108, conditions=QUICK)
     alone = prepare(prepared.features.trials, prepared.model, signals=["encoder_position"])
     assert any("no current" in note for note in alone.notes)
     found = diagnose(
@@ -248,15 +243,6 @@ def test_position_alone_works_and_says_what_is_lost() -> None:
     )
     assert found.verdict in ("effects", "unknown")
     assert np.isfinite(found.falls[-1].held_out)
-
-
-def test_json_has_the_promised_keys() -> None:
-    prepared, _ = data(["glove_stiffness"], 102)
-    content = diagnose(prepared, effect_sources(only=["glove_stiffness", "gravity"])).to_dict()
-    assert set(content) >= {"verdict", "effects", "tied", "experiments", "error", "falls", "depends_on"}
-    assert set(content["error"]) >= {"nominal", "final", "repeatability", "held_out"}
-    assert set(content["effects"][0]["parameters"]["stiffness"]) >= {"value", "low", "high", "unit"}
-    assert set(content["falls"][0]) >= {"added", "train", "held_out"}
 
 
 def test_a_glove_is_told_from_the_hands_own_spring_as_far_as_the_tolerance_of_that_says():

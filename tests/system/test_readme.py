@@ -30,13 +30,25 @@ def blocks(kind: str) -> list[Block]:
     return [Block(mark, body) for name, mark, body in found if name == kind]
 
 
+def new_user(folder: Path) -> Path:
+    """A folder with what the README's commands find beside them: the recorded closures and the saved example."""
+    shutil.copytree(ROOT / "bags", folder / "bags")
+    for block in blocks("file"):
+        (folder / block.mark).write_text(block.text, encoding="utf-8")
+    return folder
+
+
 @pytest.fixture
 def user(tmp_path: Path) -> Path:
-    """A folder with what the README's commands find beside them: the recorded closures and the saved example."""
-    shutil.copytree(ROOT / "bags", tmp_path / "bags")
-    for block in blocks("file"):
-        (tmp_path / block.mark).write_text(block.text, encoding="utf-8")
-    return tmp_path
+    return new_user(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder of a user who has found the hidden effect, and what was printed."""
+    user = new_user(tmp_path_factory.mktemp("user"))
+    find, add = (b.text for b in marked("slow") if "my_effect.py" not in b.text)
+    return user, run(find + add, user)
 
 
 def run(text: str, folder: Path, timeout: float = 250.0) -> str:
@@ -91,9 +103,9 @@ def test_own_effect_works_as_pasted(user: Path) -> None:
 
 
 @pytest.mark.slow
-def test_hidden_effect_is_found_as_printed(user: Path) -> None:
-    find, add = (b.text for b in marked("slow") if "my_effect.py" not in b.text)
-    printed = run(find + add, user)
+@pytest.mark.xdist_group("found hand")
+def test_hidden_effect_is_found_as_printed(found: tuple[Path, str]) -> None:
+    user, printed = found
     expected = re.search(r"EFFECTS  Missing: ([^.]+)\.", (ROOT / "README.md").read_text(encoding="utf-8"))
     assert expected and f"Missing: {expected[1]}." in " ".join(printed.split())
     assert (user / "lab" / "report.html").stat().st_size > 10_000
@@ -101,10 +113,9 @@ def test_hidden_effect_is_found_as_printed(user: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.ros
-def test_graph_with_the_found_model(user: Path, ros_environment: dict[str, str]) -> None:
-    run("hannes hide lab/hidden --truth lab/truth.yaml --effect load_dependent_friction --seed 7 --closures 5\n"
-        "hannes add lab/hidden --effect load_dependent_friction --out lab/my_hand.yaml", user)  # fmt: skip
-    printed = run("".join(block.text for block in marked("ros")), user)
+@pytest.mark.xdist_group("found hand")
+def test_graph_with_the_found_model(found: tuple[Path, str], ros_environment: dict[str, str]) -> None:
+    printed = run("".join(block.text for block in marked("ros")), found[0])
     assert "/hannes/motor/state" in printed
 
 
