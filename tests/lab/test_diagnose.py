@@ -69,6 +69,8 @@ def test_two_effects_of_one_name_are_refused(tmp_path: Path) -> None:
         "stribeck_friction": f"{file}:Flap",
     }
     assert "gravity" in effect_sources(["gravity"])
+    spelt = f"{tmp_path}/../{tmp_path.name}/mine.py:Flap"
+    assert effect_sources([f"{file}:Flap", spelt], only=[]) == {"stribeck_friction": f"{file}:Flap"}
 
 
 def test_nothing_is_missing_in_clean_data() -> None:

@@ -215,8 +215,9 @@ def effect_sources(
     names = list(only) if only is not None else list(catalogue())
     out: dict[str, str] = {}
     for given in (*names, *extra):
-        name = load_effect(given).name
-        if out.setdefault(name, given) != given:
+        kind = load_effect(given)
+        name = kind.name
+        if load_effect(out.setdefault(name, given)) is not kind:
             first = out[name] if ":" in out[name] else f"the catalogue's {name}"
             raise HannesError(
                 f"Two effects are named '{name}': {first} and {given}. Give yours a name of its own, or leave the "
