@@ -205,6 +205,18 @@ def test_an_effect_outside_the_catalogue_is_called_unknown(tmp_path: Path) -> No
     assert {d.variable for d in found.depends_on} == {"position", "velocity", "direction", "load", "time"}
 
 
+def test_triples_are_not_tried_where_the_pairs_lead_nowhere(tmp_path: Path) -> None:
+    file = tmp_path / "latch.py"
+    file.write_text(OUTSIDE)
+    prepared, _ = data([f"{file}:Flap"], seed=105, conditions=QUICK[1:])
+    only = ["gravity", "glove_stiffness", "encoder_offset", "return_preload"]
+    texts = set[str]()
+    found = diagnose(prepared, effect_sources(only=only), progress=lambda done, total, text: texts.add(text))
+    assert found.verdict == "unknown"
+    assert any("sets of more effects were not tried" in note for note in found.notes)
+    assert any("two effects" in text for text in texts) and not any("three" in text for text in texts)
+
+
 def test_the_users_own_effect_is_a_full_citizen(tmp_path: Path) -> None:
     """With its file given, the effect outside the catalogue is found and added, and the model file loads again."""
     file = tmp_path / "latch.py"

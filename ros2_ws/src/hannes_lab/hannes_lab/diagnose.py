@@ -79,6 +79,12 @@ MAX_EFFECTS = 3
 WIDE = (4, 3)
 """How many of the best singles and pairs are extended by every further effect."""
 
+LEFT_MOST = 0.5
+FAR_OFF = 3.0
+"""Where the best pair leaves more than this part of what the best single effect left above chance, and still so many
+times what chance reaches, triples are not tried: of three effects of the catalogue the second one found explains more
+than the third will."""
+
 
 @dataclass(frozen=True)
 class ParameterEstimate:
@@ -385,9 +391,26 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         limits_new = chance(new.problem, best.fit, new.signatures(best))
         close = tuple(c for c in near[1:] if c.penalised <= best.penalised + _tie(new))
         adequate = _adequate(new, best, limits_new)
+        left = _share_left(choice.best, round_[0], choice.limits.median)
         choice = _Choice(new, best, limits_new, adequate, ranking, close)
+        if 1 < size < max_effects and left > LEFT_MOST and best.fit.cost > FAR_OFF * limits_new.misfit:
+            choice = replace(choice, notes=(_ended_early(size, left, best, limits_new),))
+            break
         front, far = [best, *near[1:]], [c for c in wide if c not in rivals]
     return _pruned(choice)
+
+
+def _share_left(before: Candidate, after: Candidate, least: float) -> float:
+    """Part of the misfit above a complete model's that a further effect leaves."""
+    excess = before.fit.cost - least
+    return (after.fit.cost - least) / excess if excess > 0.0 else 0.0
+
+
+def _ended_early(size: int, left: float, best: Candidate, limits: Chance) -> str:
+    return (
+        f"the best {size} effects leave {100 * left:.0f} % of the misfit that {size - 1} left, and "
+        f"{best.fit.cost / limits.misfit:.0f} times what chance reaches: sets of more effects were not tried"
+    )
 
 
 def _adequate(search: Search, candidate: Candidate, limits: Chance, room: float = ADEQUATE) -> bool:
