@@ -33,6 +33,11 @@ FIRST_DOMAIN, LAST_DOMAIN = 1, 101
 DOMAIN_LOCK_PORT = 24300
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The slow tests first: at the end no process waits for another one's."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
 @pytest.fixture(scope="session")
 def repository() -> Path:
     """The root of the repository."""

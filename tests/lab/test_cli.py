@@ -29,6 +29,7 @@ def test_compare(bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: py
     assert code == 0 and content["overall"] > 2.0 and content["metrics"] and content["cells"]
 
 
+@pytest.mark.slow
 def test_diagnose_add_and_report(
     bags: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -80,6 +80,7 @@ def test_nothing_is_missing_in_clean_data() -> None:
     assert "Nothing is missing" in found.summary
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seed", "conditions"),
     [
@@ -110,6 +111,7 @@ def test_a_hidden_effect_is_named_its_parameter_recovered_and_the_error_falls(
     assert set(content["falls"][0]) >= {"added", "train", "held_out"}
 
 
+@pytest.mark.slow
 def test_friction_within_reach_of_the_tolerance_is_no_effect_but_is_pointed_at() -> None:
     """0.0125 N.m more is little over three standard deviations of the hand's own friction: a reader must see it."""
     prepared, _ = data(["coulomb_friction"], seed=3004, factor=1.25)
@@ -194,6 +196,7 @@ def test_one_closure_is_said_to_hold_nothing_out() -> None:
     assert "nan" not in found.summary and "one closure of each condition only" in found.summary
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)  # the longest search: every round is tried before the answer is "unknown"
 def test_an_effect_outside_the_catalogue_is_called_unknown(tmp_path: Path) -> None:
     file = tmp_path / "latch.py"
@@ -217,6 +220,7 @@ def test_triples_are_not_tried_where_the_pairs_lead_nowhere(tmp_path: Path) -> N
     assert any("two effects" in text for text in texts) and not any("three" in text for text in texts)
 
 
+@pytest.mark.slow
 def test_the_users_own_effect_is_a_full_citizen(tmp_path: Path) -> None:
     """With its file given, the effect outside the catalogue is found and added, and the model file loads again."""
     file = tmp_path / "latch.py"
@@ -248,6 +252,7 @@ def test_add_writes_a_model_whose_error_is_low_as_given(tmp_path: Path) -> None:
     assert sum(c.fails for c in before.cells) > sum(c.fails for c in after.cells)
 
 
+@pytest.mark.slow
 def test_position_alone_works_and_says_what_is_lost() -> None:
     prepared, _ = data(["glove_stiffness"], 108, conditions=QUICK)
     alone = prepare(prepared.features.trials, prepared.model, signals=["encoder_position"])

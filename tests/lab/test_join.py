@@ -60,6 +60,7 @@ def without_condition(recording: Recording, name: str) -> Loaded:
     return Loaded(trial, None, recording["reference_position"].period)
 
 
+@pytest.mark.slow
 def test_cut_up_recordings_give_the_answer_of_the_whole_ones(whole: list[Recording], tmp_path: Path) -> None:
     for recording in whole:
         for number, part in enumerate(cut(recording)):

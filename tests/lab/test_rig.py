@@ -94,6 +94,7 @@ def test_a_ripple_is_seen_in_the_spectrum_over_the_position(prepared: Prepared) 
     assert periods and periods[0] == pytest.approx(PERIOD, rel=0.02)
 
 
+@pytest.mark.slow
 def test_greedy_search_finds_friction_and_ripple_and_stops(prepared: Prepared) -> None:
     found = diagnose(prepared, effect_sources(only=CONSIDERED), greedy=True, max_effects=6)
     assert found.verdict == "effects"
@@ -107,6 +108,7 @@ def test_greedy_search_finds_friction_and_ripple_and_stops(prepared: Prepared) -
     assert any("stops here" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_greedy_search_is_the_same_in_two_processes(prepared: Prepared) -> None:
     """A rig from a user's file travels to the workers."""
     only = ["coulomb_friction", "viscous_friction", "command_delay"]

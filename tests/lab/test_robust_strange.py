@@ -63,6 +63,7 @@ def test_a_strange_hand_lacks_nothing(tmp_path: Path) -> None:
     assert any("something was grasped" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_an_effect_is_found_on_a_strange_hand(tmp_path: Path) -> None:
     found = diagnosed(strange_set(tmp_path, "viscous_friction"))
     assert found.verdict == "effects" and [e.name for e in found.effects] == ["viscous_friction"]

@@ -70,6 +70,7 @@ def test_what_is_unknown_of_a_recording_of_others_can_be_moved_on_every_plant(tr
         assert all(np.isfinite(signal).all() for signal in run.values()), nuisance.name
 
 
+@pytest.mark.slow
 def test_the_full_hand_fits_its_own_recordings_also_without_a_description():
     recordings, _ = make_set(FULL, [], seed=31, closures=6, conditions=("fast", "grasp"))
     trials = [make_trial(r) for r in recordings]
@@ -104,6 +105,7 @@ def test_what_belongs_to_one_trial_does_not_simulate_the_others_again():
     assert any(np.any(after[0][name] != before[0][name]) for name in before[0])
 
 
+@pytest.mark.slow
 def test_an_effect_hidden_in_the_full_hand_is_found_with_its_size():
     recordings, truth = make_set(
         FULL, [strength_of("glove_stiffness", 1.0)], seed=33, closures=5, conditions=("fast",)

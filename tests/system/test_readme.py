@@ -88,6 +88,7 @@ def test_the_example_is_as_short_as_it_says() -> None:
     assert len(lines) <= 20
 
 
+@pytest.mark.slow
 def test_own_effect_works_as_pasted(user: Path) -> None:
     """Hidden, found by name, added; the error falls to the repeatability. Few candidates, so that it is quick."""
     own = next(block.text for block in marked("slow") if "my_effect.py" in block.text)
