@@ -53,11 +53,18 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_recording(recording, tmp_path_factory.mktemp("bag") / "bag")
 
 
-def sourced(workspace: Path, environment: dict[str, str]) -> dict[str, str]:
+@pytest.fixture(scope="session")
+def overlay(workspace: Path) -> dict[str, str]:
     """The environment after `source install/setup.bash`."""
-    answer = subprocess.run(["bash", "-c", "source install/setup.bash && env -0"], cwd=workspace, env=environment,
+    answer = subprocess.run(["bash", "-c", "source install/setup.bash && env -0"], cwd=workspace,
                             capture_output=True, text=True, check=True)
     return dict(pair.split("=", 1) for pair in answer.stdout.split("\0") if "=" in pair)
+
+
+@pytest.fixture
+def sourced(overlay: dict[str, str], ros_environment: dict[str, str]) -> dict[str, str]:
+    """The same, on the test's own domain."""
+    return overlay | {name: ros_environment[name] for name in ("ROS_DOMAIN_ID", "ROS_LOG_DIR", "PYTHONUNBUFFERED")}
 
 
 def test_colcon_sees_ros_packages(tmp_path: Path) -> None:
@@ -83,14 +90,13 @@ def test_everything_is_installed_where_ros_looks(workspace: Path) -> None:
     assert (launch / "hand.launch.py").is_file()
 
 
-def test_installed_packages_carry_their_data(workspace: Path, ros_environment: dict[str, str]) -> None:
+def test_installed_packages_carry_their_data(workspace: Path, sourced: dict[str, str]) -> None:
     """Read through importlib.resources from the installed copy, not from the sources."""
-    environment = sourced(workspace, ros_environment)
     code = (
         "import hannes_description, sys; from hannes_description.model import Model; Model.load('nominal')\n"
         "print(hannes_description.__file__)"
     )
-    answer = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    answer = subprocess.run([sys.executable, "-c", code], env=sourced, capture_output=True, text=True)
     assert answer.returncode == 0, answer.stderr
     assert answer.stdout.startswith(str(workspace / "install"))
 
@@ -98,16 +104,15 @@ def test_installed_packages_carry_their_data(workspace: Path, ros_environment: d
 @pytest.mark.ros
 @pytest.mark.parametrize(("package", "executable"), NODES, ids=[name for _, name in NODES])
 def test_node_runs_and_ends_quietly(
-    workspace: Path, bag: Path, ros_environment: dict[str, str], tmp_path: Path, package: str, executable: str
+    bag: Path, sourced: dict[str, str], tmp_path: Path, package: str, executable: str
 ) -> None:
     """`ros2 run PACKAGE EXECUTABLE` for a second, then SIGINT: exit code 0 and no traceback."""
-    environment = sourced(workspace, ros_environment)
     words = [word.format(bag=bag, folder=tmp_path) for word in NEEDED.get(executable, [])]
     command = ["run", package, executable, "--ros-args", *words]
-    child = subprocess.Popen([sys.executable, "-m", "hannes_bringup.ros2_standin", *command], env=environment,
+    child = subprocess.Popen([sys.executable, "-m", "hannes_bringup.ros2_standin", *command], env=sourced,
                              cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
-        wait_for_node(child, environment)
+        wait_for_node(child, sourced)
         child.send_signal(signal.SIGINT)
         output, _ = child.communicate(timeout=30)
     finally:
@@ -143,17 +148,16 @@ def wait_for_node(child: subprocess.Popen[str], environment: dict[str, str]) -> 
 
 
 @pytest.mark.ros
-def test_unknown_parameter_is_one_line(workspace: Path, ros_environment: dict[str, str]) -> None:
-    environment = sourced(workspace, ros_environment)
+def test_unknown_parameter_is_one_line(workspace: Path, sourced: dict[str, str]) -> None:
     file = workspace / "install" / "hannes_sim" / "lib" / "hannes_sim" / "hand_sim"
-    answer = subprocess.run([file, "--ros-args", "-p", "wibble:=3"], env=environment, capture_output=True, text=True,
+    answer = subprocess.run([file, "--ros-args", "-p", "wibble:=3"], env=sourced, capture_output=True, text=True,
                             timeout=60)
     assert answer.returncode == 2
     assert re.search("wibble", answer.stderr) and "Traceback" not in answer.stderr
 
 
-def test_hannes_from_the_workspace(workspace: Path, ros_environment: dict[str, str]) -> None:
+def test_hannes_from_the_workspace(workspace: Path, sourced: dict[str, str]) -> None:
     file = workspace / "install" / "hannes_bringup" / "lib" / "hannes_bringup" / "hannes"
-    answer = subprocess.run([file, "--help"], env=sourced(workspace, ros_environment), capture_output=True, text=True)
+    answer = subprocess.run([file, "--help"], env=sourced, capture_output=True, text=True)
     assert answer.returncode == 0, answer.stderr
     assert "nodes" in answer.stdout
