@@ -391,19 +391,13 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         limits_new = chance(new.problem, best.fit, new.signatures(best))
         close = tuple(c for c in near[1:] if c.penalised <= best.penalised + _tie(new))
         adequate = _adequate(new, best, limits_new)
-        left = _share_left(choice.best, round_[0], choice.limits.median)
+        left = 1.0 - _share(choice.best, round_[0], choice.limits.median)
         choice = _Choice(new, best, limits_new, adequate, ranking, close)
         if 1 < size < max_effects and left > LEFT_MOST and best.fit.cost > FAR_OFF * limits_new.misfit:
             choice = replace(choice, notes=(_ended_early(size, left, best, limits_new),))
             break
         front, far = [best, *near[1:]], [c for c in wide if c not in rivals]
     return _pruned(choice)
-
-
-def _share_left(before: Candidate, after: Candidate, least: float) -> float:
-    """Part of the misfit above a complete model's that a further effect leaves."""
-    excess = before.fit.cost - least
-    return (after.fit.cost - least) / excess if excess > 0.0 else 0.0
 
 
 def _ended_early(size: int, left: float, best: Candidate, limits: Chance) -> str:
@@ -495,10 +489,10 @@ def _worth_showing(
     return search.found[tuple(sorted(names))], falls[: keep + 1]
 
 
-def _share(null: Candidate, candidate: Candidate, least: float) -> float:
-    """Part of the misfit above a complete model's that the candidate removes, 0..1."""
-    excess = null.fit.cost - least
-    return float(np.clip((null.fit.cost - candidate.fit.cost) / excess, 0.0, 1.0)) if excess > 0 else 0.0
+def _share(base: Candidate, candidate: Candidate, least: float) -> float:
+    """Part of the base's misfit above a complete model's that the candidate removes, 0..1."""
+    excess = base.fit.cost - least
+    return float(np.clip((base.fit.cost - candidate.fit.cost) / excess, 0.0, 1.0)) if excess > 0 else 0.0
 
 
 def _ties(choice: _Choice) -> tuple[tuple[str, ...], ...]:
