@@ -34,7 +34,7 @@ DOMAIN_LOCK_PORT = 24300
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The slow tests first: at the end no process waits for another one's."""
+    """The slow tests, and with them their modules, first: at the end no process waits for another one's."""
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 

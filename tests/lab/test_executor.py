@@ -23,7 +23,7 @@ from hannes_lab.problem import Problem
 from hannes_lab.search import Search
 from hannes_sim.effect import strength_of
 
-pytestmark = pytest.mark.xdist_group("executor")  # its fixtures take long: once, in one process
+pytestmark = pytest.mark.slow
 
 ONLY = ["glove_stiffness", "wire_slack", "gravity"]
 QUICK = ("fast", "grasp_fast")

@@ -24,8 +24,7 @@ NODES = [pair for pair in EXECUTABLES if pair[1] not in ("hannes", "hannes_ros2"
 NEEDED = {"player": ["-p", "bag:={bag}"], "recorder": ["-p", "output:={folder}/recorded"]}
 """Parameters without which a node has nothing to do."""
 
-# one build for all: with xdist these tests stay in one worker
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("colcon")]
+pytestmark = pytest.mark.slow
 
 
 def colcon(*words: str, **options: object) -> subprocess.CompletedProcess[str]:

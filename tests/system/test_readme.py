@@ -104,7 +104,6 @@ def test_own_effect_works_as_pasted(user: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("found hand")
 def test_hidden_effect_is_found_as_printed(found: tuple[Path, str]) -> None:
     user, printed = found
     expected = re.search(r"EFFECTS  Missing: ([^.]+)\.", (ROOT / "README.md").read_text(encoding="utf-8"))
@@ -114,7 +113,6 @@ def test_hidden_effect_is_found_as_printed(found: tuple[Path, str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.ros
-@pytest.mark.xdist_group("found hand")
 def test_graph_with_the_found_model(found: tuple[Path, str], ros_environment: dict[str, str]) -> None:
     printed = run("".join(block.text for block in marked("ros")), found[0])
     assert "/hannes/motor/state" in printed
