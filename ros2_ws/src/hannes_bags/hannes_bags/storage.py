@@ -195,7 +195,7 @@ def load_metadata(path: Path) -> dict[str, Any]:
         raise HannesError(f"{path} has {size} bytes; more than {_METADATA_BYTES} are not read.")
     try:
         # The C loader of libyaml overflows the stack on deep nesting; this one raises RecursionError.
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (
         yaml.YAMLError,
         ValueError,

@@ -49,7 +49,7 @@ class Qos:
     def from_text(text: str) -> Qos:
         """The first profile of a stored offered_qos_profiles; the default where it cannot be understood."""
         try:
-            profiles = yaml.load(text[:20_000], Loader=yaml.SafeLoader)
+            profiles = yaml.safe_load(text[:20_000])
         except (
             yaml.YAMLError,
             ValueError,

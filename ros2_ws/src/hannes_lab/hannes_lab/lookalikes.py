@@ -88,7 +88,7 @@ def _signatures(search: Search, name: str) -> list[Array]:
     null = search.null().fit
     kind = search.effect(name)
     model, coordinates = search.with_effects((name,))
-    here = {c.name: c.value(float(z)) for c, z in zip(null.coordinates, null.z, strict=True)}
+    here = null.values
     shapes = [
         [(f"{name}.{p.name}", v) for v in dict.fromkeys((p.typical, *p.starts))]
         for p in kind.parameters

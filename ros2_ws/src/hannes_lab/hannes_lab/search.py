@@ -475,7 +475,7 @@ class Search:
         return dict(zip(names, found, strict=True))
 
     def _signature(self, base: Candidate, name: str) -> list[Array]:
-        here = {c.name: c.value(float(z)) for c, z in zip(base.fit.coordinates, base.fit.z, strict=True)}
+        here = base.fit.values
         kind = self.effect(name)
         model, coordinates = self.with_effects((*base.names, name))
         own = [c for c in coordinates if c.name.startswith(f"{name}.")]
