@@ -27,8 +27,8 @@ demo: setup ## a closure recorded, compared, diagnosed; ends with the path of a 
 test: setup ## all tests
 	@$(BIN)/python -m pytest $(PYTEST_FLAGS) $(TESTS)
 
-check: setup ## ruff and mypy
-	@status=0; $(BIN)/ruff check . || status=1; $(BIN)/mypy --config-file pyproject.toml || status=1; exit $$status
+check: setup ## ruff (rules and layout) and mypy
+	@status=0; $(BIN)/ruff check . || status=1; $(BIN)/ruff format --check --quiet . || status=1; $(BIN)/mypy --config-file pyproject.toml || status=1; exit $$status
 
 bench: setup ## speed and identification benchmarks, as ratios in one run
 	@for file in bench/*.py; do echo "== $$file"; $(BIN)/python $$file || exit 1; done

@@ -85,7 +85,9 @@ def draw(found: Diagnosis, repeats: dict[str, float], path: Path) -> None:
         errors = [factor * fall.held_out_signals[signal] for fall in falls]
         bars = ax.barh(labels, errors, height=0.5, color="#1064ab")
         ax.bar_label(bars, [f"{e:.2f}" for e in errors], padding=4)
-        ax.axvline(factor * repeats[signal], color="#117a44", linestyle="--", label="repeatability from lap to lap")
+        ax.axvline(
+            factor * repeats[signal], color="#117a44", linestyle="--", label="repeatability from lap to lap"
+        )
         ax.set_title(f"{signal.replace('_', ' ')}, {unit}", loc="left")
         ax.set_xlim(0.0, 1.12 * max(errors))
         ax.spines[["top", "right"]].set_visible(False)

@@ -139,7 +139,9 @@ def run_case(case: Case) -> dict[str, Any]:
         "hidden": hidden,
         "factor": case.factor,
         "seed": case.seed,
-        "loggers": next((n for n, given in LOGGERS.items() if given == (case.sensors, case.signals)), "30 Hz"),
+        "loggers": next(
+            (n for n, given in LOGGERS.items() if given == (case.sensors, case.signals)), "30 Hz"
+        ),
         "verdict": found.verdict,
         "named": named,
         "tied": [sorted(t) for t in found.tied],
@@ -222,9 +224,7 @@ def cases(kinds: list[str], limits: dict[str, float], quick: bool, first: int = 
             itertools.product(outside_effects.NAMES, (1.0,) if quick else (0.5, 1.0, 2.0))
         ):
             source = f"{OUTSIDE}:{name}"
-            out.append(
-                Case("outside", ((source, strength(source, factor)),), factor, first + 30_000 + k)
-            )
+            out.append(Case("outside", ((source, strength(source, factor)),), factor, first + 30_000 + k))
     typical = [(name, strength(name, min(1.0, highest_factor(name)))) for name in names]
     if "typical" in kinds:
         out += [Case("typical", (one,), 1.0, first + 40_000 + k) for k, one in enumerate(typical)]

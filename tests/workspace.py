@@ -81,20 +81,26 @@ class Package:
         return config
 
     def lines(self, section: str, option: str) -> list[str]:
-        stripped = (line.split("#")[0].strip() for line in self.config.get(section, option, fallback="").splitlines())
+        stripped = (
+            line.split("#")[0].strip() for line in self.config.get(section, option, fallback="").splitlines()
+        )
         return [line for line in stripped if line]
 
     @property
     def requirements(self) -> set[str]:
         """Names in install_requires, lower case; our own packages as they are spelt."""
-        return {re.split(r"[\s<>=!~\[;]", line)[0].lower() for line in self.lines("options", "install_requires")}
+        return {
+            re.split(r"[\s<>=!~\[;]", line)[0].lower() for line in self.lines("options", "install_requires")
+        }
 
     @property
     def optional(self) -> set[str]:
         """Names in the extras, lower case."""
         extras = "options.extras_require"
         names = self.config[extras] if self.config.has_section(extras) else ()
-        return {re.split(r"[\s<>=!~\[;]", line)[0].lower() for name in names for line in self.lines(extras, name)}
+        return {
+            re.split(r"[\s<>=!~\[;]", line)[0].lower() for name in names for line in self.lines(extras, name)
+        }
 
     @property
     def entry_points(self) -> dict[str, str]:
@@ -123,4 +129,6 @@ class Package:
         return found - sys.stdlib_module_names - {self.name}
 
 
-PACKAGES = {folder.name: Package(folder) for folder in sorted(p.parent for p in SOURCES.glob("*/package.xml"))}
+PACKAGES = {
+    folder.name: Package(folder) for folder in sorted(p.parent for p in SOURCES.glob("*/package.xml"))
+}

@@ -85,13 +85,13 @@ class Emps(PlantRig):
             data = loadmat(path)
             t, reference, position, voltage, gtau = (np.asarray(data[n], float).ravel() for n in FIELDS)
         except (KeyError, IndexError, ValueError, OSError, MatReadError) as error:
-            raise HannesError(
-                f"'{path}' is no recording of EMPS with {', '.join(FIELDS)}: {error}."
-            ) from error
+            message = f"'{path}' is no recording of EMPS with {', '.join(FIELDS)}: {error}."
+            raise HannesError(message) from error
         period = round(float(np.median(np.diff(t))), 6)
         grid = np.arange(t.size) * period
         at = [round(1e3 * float(r)) for r in reference]
-        moves = [(a, b, at[round(a / period)], at[round(b / period)]) for a, b in find_moves(reference, period)]
+        found = find_moves(reference, period)
+        moves = [(a, b, at[round(a / period)], at[round(b / period)]) for a, b in found]
         closures = [Closure(a, b, f"{start} to {stop} mm") for a, b, start, stop in moves]
         signals = {"drive_force": (grid, float(gtau[0]) * voltage), "encoder_position": (grid, position)}
         return Trial("emps", period, reference, signals, tuple(closures), {"gtau": float(gtau[0])}, str(path),

@@ -47,7 +47,7 @@ def test_closes_fully_holds_and_opens(recording):
     reference = emg_reference(recording.flexor, recording.extensor).reference
     assert reference.min() == 0.0
     assert reference.max() == FULL_CLOSURE
-    held = reference[int(2.4 * 300):int(2.9 * 300)]
+    held = reference[int(2.4 * 300) : int(2.9 * 300)]
     np.testing.assert_array_equal(held, FULL_CLOSURE)
     assert reference[int(5.3 * 300)] == 0.0
 
@@ -113,18 +113,23 @@ def test_resampling_keeps_the_signal():
     assert tone.resampled(500) is tone
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("t_s,close\n0,1\n", "no column 'open'"),
-    ("", "no column 't_s'"),
-    ("t_s,close,open\n0,1,x\n", "line 2: open is 'x', not a number"),
-    ("t_s,close,open\n0,1,nan\n", "open is nan"),
-    ("t_s,close,open\n0,1\n", "line 2: open is None"),
-    ("t_s,close,open\n0,1,1\n0,1,1\n", "line 3: the time 0.0 s is not after"),
-    ("t_s,close,open\n0,1,1\n", "1 samples"),
-    ("t_s,close,open\n" + "".join(f"{k / 100 + (k > 9)},0,0\n" for k in range(20)),
-     "samples are missing after t = 0.09"),
-    ("t_s,close,open\n\xff\xfe", "not a number|Cannot read"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t_s,close\n0,1\n", "no column 'open'"),
+        ("", "no column 't_s'"),
+        ("t_s,close,open\n0,1,x\n", "line 2: open is 'x', not a number"),
+        ("t_s,close,open\n0,1,nan\n", "open is nan"),
+        ("t_s,close,open\n0,1\n", "line 2: open is None"),
+        ("t_s,close,open\n0,1,1\n0,1,1\n", "line 3: the time 0.0 s is not after"),
+        ("t_s,close,open\n0,1,1\n", "1 samples"),
+        (
+            "t_s,close,open\n" + "".join(f"{k / 100 + (k > 9)},0,0\n" for k in range(20)),
+            "samples are missing after t = 0.09",
+        ),
+        ("t_s,close,open\n\xff\xfe", "not a number|Cannot read"),
+    ],
+)
 def test_bad_files_give_one_clear_error(tmp_path: Path, text: str, message: str):
     path = tmp_path / "emg.csv"
     path.write_bytes(text.encode("latin-1"))
@@ -137,10 +142,15 @@ def test_missing_file(tmp_path: Path):
         read_emg_csv(tmp_path / "none.csv")
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"rate": 0.0}, "'rate' is 0"), ({"envelope_cutoff": 200.0}, "below half the rate"),
-    ({"speed": float("nan")}, "'speed' is nan"), ({"close_threshold": 0.05}, "at least the dead band"),
-])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rate": 0.0}, "'rate' is 0"),
+        ({"envelope_cutoff": 200.0}, "below half the rate"),
+        ({"speed": float("nan")}, "'speed' is nan"),
+        ({"close_threshold": 0.05}, "at least the dead band"),
+    ],
+)
 def test_bad_parameters_are_named(options, message):
     with pytest.raises(HannesError, match=message):
         EmgParameters(**options)

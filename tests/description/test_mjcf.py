@@ -30,7 +30,9 @@ def test_every_variant_compiles_with_all_joints(mechanism: str, transmission: st
     assert {model.joint(k).name for k in range(model.njnt)} >= set(JOINT_NAMES)
     assert model.nv == (16 if transmission == "wires" else 14)
     for name in JOINT_NAMES:
-        np.testing.assert_allclose(model.joint(name).range, [JOINT_LIMITS[name].lower, JOINT_LIMITS[name].upper])
+        np.testing.assert_allclose(
+            model.joint(name).range, [JOINT_LIMITS[name].lower, JOINT_LIMITS[name].upper]
+        )
 
 
 def test_unknown_options_are_named() -> None:
@@ -55,14 +57,22 @@ def test_the_differential_shares_the_tension_as_the_thesis_says() -> None:
 
 def test_all_wires_together_take_up_the_pulley_range() -> None:
     taken = sum(arm * JOINT_LIMITS[name].upper for name, arm in transmission_jacobian(PARAMETERS).items())
-    assert taken == pytest.approx(PARAMETERS.value("hand.travel") * PARAMETERS.value("pulley.radius"), rel=0.01)
+    assert taken == pytest.approx(
+        PARAMETERS.value("hand.travel") * PARAMETERS.value("pulley.radius"), rel=0.01
+    )
 
 
 @pytest.mark.parametrize("transmission", TRANSMISSIONS)
 def test_the_rotor_is_felt_at_the_wire(transmission: str) -> None:
     """A force on the taut wire accelerates rotor and hand together: nearly F/m, since the hand is light."""
-    off = {"friction.coulomb": 0.0, "friction.viscous": 0.0, "joints.friction_tension": 0.0, "carts.friction": 0.0,
-           "joints.damping_tension": 0.0, "carts.damping": 0.0}
+    off = {
+        "friction.coulomb": 0.0,
+        "friction.viscous": 0.0,
+        "joints.friction_tension": 0.0,
+        "carts.friction": 0.0,
+        "joints.damping_tension": 0.0,
+        "carts.damping": 0.0,
+    }
     model = build_spec(PARAMETERS.with_values(off), {"transmission": transmission}).compile()
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     data = mujoco.MjData(model)

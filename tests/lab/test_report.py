@@ -31,43 +31,134 @@ def make_comparison(*, off: float = 0.3, condition: str = "slow", closures: int 
     def ratio_of(rmse: float) -> float:
         return NAN if single else rmse / floor
 
-    cells = [{"condition": condition, "signal": "encoder_position", "phase": p, "unit": "rad", "rmse": off, "bias": off,
-              "repeatability": floor, "ratio": ratio_of(off), "p_value": NAN if single else 0.0005,
-              "fails": not single and off > 0.1} for p in ("void", "hold", "opening")]
+    cells = [
+        {
+            "condition": condition,
+            "signal": "encoder_position",
+            "phase": p,
+            "unit": "rad",
+            "rmse": off,
+            "bias": off,
+            "repeatability": floor,
+            "ratio": ratio_of(off),
+            "p_value": NAN if single else 0.0005,
+            "fails": not single and off > 0.1,
+        }
+        for p in ("void", "hold", "opening")
+    ]
     return {
-        "model": {"name": "nominal", "sha256": "ab" * 32}, "fitted": True, "overall": ratio_of(off),
-        "errors": [{"condition": condition, "signal": "encoder_position", "unit": "rad", "rmse": off,
-                    "repeatability": floor, "ratio": ratio_of(off)}],
+        "model": {"name": "nominal", "sha256": "ab" * 32},
+        "fitted": True,
+        "overall": ratio_of(off),
+        "errors": [
+            {
+                "condition": condition,
+                "signal": "encoder_position",
+                "unit": "rad",
+                "rmse": off,
+                "repeatability": floor,
+                "ratio": ratio_of(off),
+            }
+        ],
         "cells": cells,
-        "overlays": [{"condition": condition, "signal": "encoder_position", "unit": "rad", "phase": PHASE, "time": TIME,
-                      "measured": measured, "low": [v - sd for v in measured], "high": [v + sd for v in measured],
-                      "model": [v + off for v in measured], "reference": measured}],
-        "metrics": [{"condition": condition, "name": "closure_time", "unit": "s", "measured": 0.91,
-                     "sd": NAN if single else 0.012, "model": 0.95, "relative_error_percent": -4.4}],
+        "overlays": [
+            {
+                "condition": condition,
+                "signal": "encoder_position",
+                "unit": "rad",
+                "phase": PHASE,
+                "time": TIME,
+                "measured": measured,
+                "low": [v - sd for v in measured],
+                "high": [v + sd for v in measured],
+                "model": [v + off for v in measured],
+                "reference": measured,
+            }
+        ],
+        "metrics": [
+            {
+                "condition": condition,
+                "name": "closure_time",
+                "unit": "s",
+                "measured": 0.91,
+                "sd": NAN if single else 0.012,
+                "model": 0.95,
+                "relative_error_percent": -4.4,
+            }
+        ],
         "depends_on": {
-            "load": {"variable": "load", "signal": "encoder_position", "share": 0.52, "centres": [0.1, 0.2, 0.9],
-                     "curve": [0.01, -0.02, 0.05]},
-            "direction": {"variable": "direction", "signal": "encoder_position", "share": 0.2,
-                          "centres": [-11.0, 0.0, 11.0], "curve": [0.01, 0.0, -0.01]},
-            "time": {"variable": "time", "signal": "encoder_position", "share": 0.0, "centres": [], "curve": []}},
-        "data": [{"name": condition, "source": "bags/slow", "sha256": "cd" * 32, "conditions": [condition],
-                  "closures": closures, "signals": ["encoder_position"]}],
+            "load": {
+                "variable": "load",
+                "signal": "encoder_position",
+                "share": 0.52,
+                "centres": [0.1, 0.2, 0.9],
+                "curve": [0.01, -0.02, 0.05],
+            },
+            "direction": {
+                "variable": "direction",
+                "signal": "encoder_position",
+                "share": 0.2,
+                "centres": [-11.0, 0.0, 11.0],
+                "curve": [0.01, 0.0, -0.01],
+            },
+            "time": {
+                "variable": "time",
+                "signal": "encoder_position",
+                "share": 0.0,
+                "centres": [],
+                "curve": [],
+            },
+        },
+        "data": [
+            {
+                "name": condition,
+                "source": "bags/slow",
+                "sha256": "cd" * 32,
+                "conditions": [condition],
+                "closures": closures,
+                "signals": ["encoder_position"],
+            }
+        ],
         "notes": ["there is one condition only"],
     }
 
 
 def make_fall(added: str, train: float, held_out: float) -> dict[str, Any]:
-    return {"added": added, "train": train, "held_out": held_out, "by_condition": {"slow": held_out, "fast": NAN},
-            "signals": [{"condition": "slow", "signal": "encoder_position", "unit": "rad", "rmse": 0.05 * held_out,
-                         "repeatability": 0.05, "ratio": held_out}]}
+    return {
+        "added": added,
+        "train": train,
+        "held_out": held_out,
+        "by_condition": {"slow": held_out, "fast": NAN},
+        "signals": [
+            {
+                "condition": "slow",
+                "signal": "encoder_position",
+                "unit": "rad",
+                "rmse": 0.05 * held_out,
+                "repeatability": 0.05,
+                "ratio": held_out,
+            }
+        ],
+    }
 
 
 def make_effect(name: str = "glove_stiffness") -> dict[str, Any]:
-    return {"name": name, "title": name.replace("_", " "), "source": None, "why": "It grows with the closing angle.",
-            "parameters": {"stiffness": {"value": 0.0017743, "low": 0.0017166, "high": 0.001832, "unit": "N.m/rad",
-                                         "identified": True},
-                           "hardening": {"value": 5e-6, "low": 0.0, "high": 1e-4, "unit": "N.m/rad3",
-                                         "identified": False}}}
+    return {
+        "name": name,
+        "title": name.replace("_", " "),
+        "source": None,
+        "why": "It grows with the closing angle.",
+        "parameters": {
+            "stiffness": {
+                "value": 0.0017743,
+                "low": 0.0017166,
+                "high": 0.001832,
+                "unit": "N.m/rad",
+                "identified": True,
+            },
+            "hardening": {"value": 5e-6, "low": 0.0, "high": 1e-4, "unit": "N.m/rad3", "identified": False},
+        },
+    }
 
 
 def make_diagnosis(verdict: str) -> dict[str, Any]:
@@ -76,22 +167,60 @@ def make_diagnosis(verdict: str) -> dict[str, Any]:
     falls += [make_fall(e["name"], 0.9, 0.95) for e in effects]
     tied = [["glove_stiffness"], ["gravity"]] if verdict == "effects" else []
     return {
-        "verdict": verdict, "summary": f"A summary of {verdict}.", "effects": effects, "tied": tied,
-        "experiments": [{"name": "fast_void", "profile": "half_sine", "options": {"period": 1.5}, "object": "none",
-                         "distance": 12.0, "separates": tied,
-                         "command": "hannes record --profile half_sine --option period=1.5 --object none"}][:len(tied)],
-        "error": {"nominal": 57.6, "final": falls[-1]["held_out"], "repeatability": 1.0, "held_out": True, "unit": "x"},
+        "verdict": verdict,
+        "summary": f"A summary of {verdict}.",
+        "effects": effects,
+        "tied": tied,
+        "experiments": [
+            {
+                "name": "fast_void",
+                "profile": "half_sine",
+                "options": {"period": 1.5},
+                "object": "none",
+                "distance": 12.0,
+                "separates": tied,
+                "command": "hannes record --profile half_sine --option period=1.5 --object none",
+            }
+        ][: len(tied)],
+        "error": {
+            "nominal": 57.6,
+            "final": falls[-1]["held_out"],
+            "repeatability": 1.0,
+            "held_out": True,
+            "unit": "x",
+        },
         "falls": falls,
-        "ranking": [{"names": ["glove_stiffness"], "cost": 948.0, "explained": 0.9992},
-                    {"names": ["gravity"], "cost": 1853.0, "explained": 0.41}],
+        "ranking": [
+            {"names": ["glove_stiffness"], "cost": 948.0, "explained": 0.9992},
+            {"names": ["gravity"], "cost": 1853.0, "explained": 0.41},
+        ],
         "depends_on": make_comparison(off=0.01)["depends_on"],
         "chance": {"misfit": 907.0, "gain": 28.6, "median": 753.0, "draws": 400, "resampled": True},
-        "costs": {"nominal_fitted": 700.0 if verdict == "nothing" else 244979.0, "final": 700.0, "critical": 907.0},
+        "costs": {
+            "nominal_fitted": 700.0 if verdict == "nothing" else 244979.0,
+            "final": 700.0,
+            "critical": 907.0,
+        },
         "nuisances": {
-            "motor.kt": {"value": 0.0162, "nominal": 0.0174, "prior_sds": -2.55, "low": 0.0161, "high": 0.0163},
-            "encoder.zero@slow": {"value": 0.033, "nominal": 0.0, "prior_sds": 10.6, "low": 0.0, "high": 0.04}},
-        "notes": ["stiffness and preload cannot be told apart well"], "simulations": 22777,
-        "data": make_comparison()["data"], "model": {"name": "nominal", "sha256": "ef" * 32},
+            "motor.kt": {
+                "value": 0.0162,
+                "nominal": 0.0174,
+                "prior_sds": -2.55,
+                "low": 0.0161,
+                "high": 0.0163,
+            },
+            "encoder.zero@slow": {
+                "value": 0.033,
+                "nominal": 0.0,
+                "prior_sds": 10.6,
+                "low": 0.0,
+                "high": 0.04,
+            },
+        },
+        "notes": ["stiffness and preload cannot be told apart well"],
+        "simulations": 22777,
+        "data": make_comparison()["data"],
+        "model": {"name": "nominal", "sha256": "ef" * 32},
     }
 
 
@@ -149,24 +278,43 @@ class Page(HTMLParser):
 
 
 def page_of(**parts: Any) -> Page:
-    given = {"comparison": None, "after": None, "diagnosis": None, "title": "Test", "command": "hannes diagnose x"}
+    given = {
+        "comparison": None,
+        "after": None,
+        "diagnosis": None,
+        "title": "Test",
+        "command": "hannes diagnose x",
+    }
     page = Page(render_report(**{**given, **parts}))
     assert page.open == []
     return page
 
 
-@pytest.mark.parametrize(("verdict", "headline"), [
-    ("nothing", "Nothing is missing from the model."),
-    ("effects", "The model lacks glove stiffness or gravity: these data cannot tell which."),
-    ("unknown", "Something is missing that the catalogue does not hold."),
-])
+@pytest.mark.parametrize(
+    ("verdict", "headline"),
+    [
+        ("nothing", "Nothing is missing from the model."),
+        ("effects", "The model lacks glove stiffness or gravity: these data cannot tell which."),
+        ("unknown", "Something is missing that the catalogue does not hold."),
+    ],
+)
 def test_every_verdict(verdict: str, headline: str) -> None:
     after = None if verdict == "nothing" else make_comparison(off=0.05)
     page = page_of(comparison=make_comparison(), after=after, diagnosis=make_diagnosis(verdict))
     assert headline in page.words
     assert f"A summary of {verdict}." in page.words
     assert ("section", "verdict " + verdict) in {(t, a.get("class")) for t, a in page.elements}
-    assert {"verdict", "fall", "overlays", "map", "depends", "ranking", "metrics", "nuisances", "data"} <= page.ids
+    assert {
+        "verdict",
+        "fall",
+        "overlays",
+        "map",
+        "depends",
+        "ranking",
+        "metrics",
+        "nuisances",
+        "data",
+    } <= page.ids
     assert ("effects" in page.ids) == (verdict != "nothing")
     assert "hannes diagnose x" in page.words
     assert "cd" * 32 in page.words
@@ -174,11 +322,26 @@ def test_every_verdict(verdict: str, headline: str) -> None:
 
 
 def test_what_the_page_shows_of_an_effect() -> None:
-    page = page_of(comparison=make_comparison(), after=make_comparison(off=0.05), diagnosis=make_diagnosis("effects"))
-    for part in ("1.774", "1.717 … 1.832", "10⁻³ N·m/rad", "not identified by these data",
-                 "The experiment that separates", "99.9 %", "+10.6",
-                 "hannes record --profile half_sine --option period=1.5 --object none",
-                 "−2.5", "57.6", "0.95", "0.910 ± 0.012", "−4.4 %", "3 of 3 beyond chance", "0 of 3 beyond chance"):
+    page = page_of(
+        comparison=make_comparison(), after=make_comparison(off=0.05), diagnosis=make_diagnosis("effects")
+    )
+    for part in (
+        "1.774",
+        "1.717 … 1.832",
+        "10⁻³ N·m/rad",
+        "not identified by these data",
+        "The experiment that separates",
+        "99.9 %",
+        "+10.6",
+        "hannes record --profile half_sine --option period=1.5 --object none",
+        "−2.5",
+        "57.6",
+        "0.95",
+        "0.910 ± 0.012",
+        "−4.4 %",
+        "3 of 3 beyond chance",
+        "0 of 3 beyond chance",
+    ):
         assert part in page.words.replace("\u00a0", " "), part
     for target in [a["href"] for t, a in page.elements if t == "a"]:
         assert target is not None
@@ -202,19 +365,33 @@ def test_shared_effects_of_a_tie() -> None:
     diagnosis = make_diagnosis("effects")
     diagnosis["effects"].append(make_effect("gravity"))
     diagnosis["tied"] = [["glove_stiffness", "gravity"], ["glove_stiffness", "return_preload"]]
-    assert ("The model lacks glove stiffness and one of these: gravity or return preload. The data cannot tell which."
-            in page_of(diagnosis=diagnosis).words)
+    assert (
+        "The model lacks glove stiffness and one of these: gravity or return preload. The data cannot tell which."
+        in page_of(diagnosis=diagnosis).words
+    )
 
 
-@pytest.mark.parametrize("parts", [
-    {"comparison": make_comparison()},
-    {"comparison": None, "after": make_comparison()},
-    {"comparison": make_comparison(closures=1)},
-    {"diagnosis": make_diagnosis("unknown")},
-    {"diagnosis": {"verdict": "effects"}},
-    {"diagnosis": {"verdict": "<b>new"}},
-    {"comparison": {"overall": None}},
-], ids=["comparison", "after only", "one closure", "diagnosis", "bare diagnosis", "other verdict", "bare comparison"])
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"comparison": make_comparison()},
+        {"comparison": None, "after": make_comparison()},
+        {"comparison": make_comparison(closures=1)},
+        {"diagnosis": make_diagnosis("unknown")},
+        {"diagnosis": {"verdict": "effects"}},
+        {"diagnosis": {"verdict": "<b>new"}},
+        {"comparison": {"overall": None}},
+    ],
+    ids=[
+        "comparison",
+        "after only",
+        "one closure",
+        "diagnosis",
+        "bare diagnosis",
+        "other verdict",
+        "bare comparison",
+    ],
+)
 def test_missing_parts(parts: dict[str, Any]) -> None:
     page = page_of(**parts)
     assert "verdict" in page.ids
@@ -235,7 +412,11 @@ def test_overlays_of_the_same_condition_keep_their_counterparts() -> None:
     after = make_comparison(off=0.05)
     after["overlays"] *= 2
     page = page_of(comparison=two, after=after)
-    pairs = [(a["data-overlay"], a["data-after"]) for t, a in page.elements if t == "figure" and "data-overlay" in a]
+    pairs = [
+        (a["data-overlay"], a["data-after"])
+        for t, a in page.elements
+        if t == "figure" and "data-overlay" in a
+    ]
     assert pairs == [("0", "0"), ("1", "1")]
 
 
@@ -246,17 +427,24 @@ def hostile(data: Any) -> Any:
     """The same data with every text made hostile, phases and variables too."""
     if isinstance(data, dict):
         # names of variables and parameters are keys
-        return {(HOSTILE + k if isinstance(v, dict) and {"value", "centres"} & set(v) else k): hostile(v)
-                for k, v in data.items()}
+        return {
+            (HOSTILE + k if isinstance(v, dict) and {"value", "centres"} & set(v) else k): hostile(v)
+            for k, v in data.items()
+        }
     if isinstance(data, list):
         return [hostile(v) for v in data]
     return HOSTILE + data if isinstance(data, str) else data
 
 
 def test_everything_from_the_data_is_escaped(tmp_path: Path) -> None:
-    clean = page_of(comparison=make_comparison(), after=make_comparison(), diagnosis=make_diagnosis("effects"))
-    bad = {"comparison": hostile(make_comparison()), "after": hostile(make_comparison()),
-           "diagnosis": {**hostile(make_diagnosis("effects")), "verdict": "effects"}}
+    clean = page_of(
+        comparison=make_comparison(), after=make_comparison(), diagnosis=make_diagnosis("effects")
+    )
+    bad = {
+        "comparison": hostile(make_comparison()),
+        "after": hostile(make_comparison()),
+        "diagnosis": {**hostile(make_diagnosis("effects")), "verdict": "effects"},
+    }
     page = page_of(**bad, title=HOSTILE, command=HOSTILE)
     assert len(page.scripts) == len(clean.scripts) == 3
     assert not [t for t, _ in page.elements if t in ("img", "iframe", "object", "link", "base", "form")]
@@ -264,22 +452,31 @@ def test_everything_from_the_data_is_escaped(tmp_path: Path) -> None:
     assert "49" not in page.data["title"]
     assert page.data["title"] == HOSTILE
     for _, attrs in page.elements:
-        assert "alert" not in (attrs.get("style") or "") + (attrs.get("class") or "") + (attrs.get("id") or "")
+        assert "alert" not in (attrs.get("style") or "") + (attrs.get("class") or "") + (
+            attrs.get("id") or ""
+        )
     write_picture(tmp_path / "hostile.png", **bad, title=HOSTILE)
 
 
 def test_nothing_is_requested_and_only_our_scripts_run() -> None:
-    source = render_report(comparison=make_comparison(), after=make_comparison(), diagnosis=make_diagnosis("effects"),
-                           title="Test", command="x")
+    source = render_report(
+        comparison=make_comparison(),
+        after=make_comparison(),
+        diagnosis=make_diagnosis("effects"),
+        title="Test",
+        command="x",
+    )
     page = Page(source)
     assert not [a for _, a in page.elements if {"src", "srcset", "data", "poster", "action"} & set(a)]
     assert all((a.get("href") or "#").startswith("#") for _, a in page.elements)
     assert not re.search(r"url\(|@import|@font-face", page.style)
     code = "".join(body for _, body in page.scripts)
-    assert not re.search(r"fetch\(|XMLHttpRequest|WebSocket|EventSource|importScripts|sendBeacon|\bimport\s*\(", code)
+    assert not re.search(
+        r"fetch\(|XMLHttpRequest|WebSocket|EventSource|importScripts|sendBeacon|\bimport\s*\(", code
+    )
     # Addresses stand in comments and licences only, never in an attribute or a style
     for found in re.finditer(r"https?://", source):
-        before = source[max(0, found.start() - 12):found.start()]
+        before = source[max(0, found.start() - 12) : found.start()]
         assert not re.search(r"(src|href|url\(|@import)\s*=?\s*[\"']?$", before)
     policy = next(a["content"] for t, a in page.elements if a.get("http-equiv") == "Content-Security-Policy")
     assert policy is not None
@@ -304,8 +501,13 @@ def test_the_data_are_inside_as_json() -> None:
 
 
 def test_the_same_data_give_the_same_page_and_it_is_small(tmp_path: Path) -> None:
-    parts: dict[str, Any] = {"comparison": make_comparison(), "after": make_comparison(off=0.05),
-                             "diagnosis": make_diagnosis("effects"), "title": "Test", "command": "x"}
+    parts: dict[str, Any] = {
+        "comparison": make_comparison(),
+        "after": make_comparison(off=0.05),
+        "diagnosis": make_diagnosis("effects"),
+        "title": "Test",
+        "command": "x",
+    }
     first = write_report(tmp_path / "deep" / "a.html", **parts)
     second = write_report(tmp_path / "b.html", **parts)
     assert first.read_bytes() == second.read_bytes()
@@ -316,9 +518,14 @@ def test_a_large_data_set_stays_below_the_limit() -> None:
     def large(off: float) -> dict[str, Any]:
         out = make_comparison(off=off)
         n = 160
-        long = {"phase": ["void"] * n, **{k: [math.sin(0.1 * i) for i in range(n)]
-                                         for k in ("measured", "low", "high", "model", "reference")},
-                "time": [0.01 * i for i in range(n)]}
+        long = {
+            "phase": ["void"] * n,
+            **{
+                k: [math.sin(0.1 * i) for i in range(n)]
+                for k in ("measured", "low", "high", "model", "reference")
+            },
+            "time": [0.01 * i for i in range(n)],
+        }
         out["overlays"] = [{**out["overlays"][0], **long, "condition": f"c{i}"} for i in range(18)]
         return out
 
@@ -340,12 +547,20 @@ def test_clear_errors(tmp_path: Path) -> None:
         write_picture(tmp_path / "file" / "a.png", comparison=make_comparison())
 
 
-@pytest.mark.parametrize("parts", [
-    {"comparison": make_comparison(), "after": make_comparison(off=0.05), "diagnosis": make_diagnosis("effects")},
-    {"comparison": make_comparison(closures=1)},
-    {"comparison": None, "diagnosis": make_diagnosis("nothing")},
-    {"comparison": {"overall": None}},
-], ids=["whole", "one closure", "diagnosis", "bare"])
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {
+            "comparison": make_comparison(),
+            "after": make_comparison(off=0.05),
+            "diagnosis": make_diagnosis("effects"),
+        },
+        {"comparison": make_comparison(closures=1)},
+        {"comparison": None, "diagnosis": make_diagnosis("nothing")},
+        {"comparison": {"overall": None}},
+    ],
+    ids=["whole", "one closure", "diagnosis", "bare"],
+)
 def test_picture(parts: dict[str, Any], tmp_path: Path) -> None:
     made = write_picture(tmp_path / "a" / "picture.png", **parts)
     assert made.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
@@ -358,23 +573,47 @@ def test_picture_as_svg_is_the_same_every_time(tmp_path: Path) -> None:
     assert b"<svg" in first.read_bytes()
 
 
-@pytest.mark.parametrize(("made", "text"), [
-    (number(0.00295), "0.00295"), (number(12.3456), "12.3"), (number(1.2345e-5), "1.23 × 10⁻⁵"), (number(NAN), "–"),
-    (number(None), "–"), (number(0.0), "0"), (number(-0.5), "−0.500"), (number(True), "–"),
-    (number(123456.7), "1.23 × 10⁵"),
-    (ratio(0.912), "0.91"), (ratio(57.58), "57.6"), (ratio(1234.0), "1234"), (ratio(NAN), "–"),
-    (percent(0.9992), "> 99\u00a0%"), (percent(0.9992, 1), "99.9\u00a0%"), (percent(1.0), "100\u00a0%"),
-    (percent(0.0001), "< 1\u00a0%"), (percent(0.0), "0\u00a0%"),
-    (signed_percent(-8.25), "−8.2\u00a0%"), (signed_percent(3.0), "+3.0\u00a0%"), (signed_percent(0.01), "0.0\u00a0%"),
-    (plus_minus(0.26739, 0.00192), "0.2674 ± 0.0019"), (plus_minus(0.877, 2e-16), "0.877 ± 0"),
-    (plus_minus(5.0, NAN), "5.00"), (unit("kg.m2"), "kg·m²"), (unit("N.m/rad3"), "N·m/rad³"),
-])
+@pytest.mark.parametrize(
+    ("made", "text"),
+    [
+        (number(0.00295), "0.00295"),
+        (number(12.3456), "12.3"),
+        (number(1.2345e-5), "1.23 × 10⁻⁵"),
+        (number(NAN), "–"),
+        (number(None), "–"),
+        (number(0.0), "0"),
+        (number(-0.5), "−0.500"),
+        (number(True), "–"),
+        (number(123456.7), "1.23 × 10⁵"),
+        (ratio(0.912), "0.91"),
+        (ratio(57.58), "57.6"),
+        (ratio(1234.0), "1234"),
+        (ratio(NAN), "–"),
+        (percent(0.9992), "> 99\u00a0%"),
+        (percent(0.9992, 1), "99.9\u00a0%"),
+        (percent(1.0), "100\u00a0%"),
+        (percent(0.0001), "< 1\u00a0%"),
+        (percent(0.0), "0\u00a0%"),
+        (signed_percent(-8.25), "−8.2\u00a0%"),
+        (signed_percent(3.0), "+3.0\u00a0%"),
+        (signed_percent(0.01), "0.0\u00a0%"),
+        (plus_minus(0.26739, 0.00192), "0.2674 ± 0.0019"),
+        (plus_minus(0.877, 2e-16), "0.877 ± 0"),
+        (plus_minus(5.0, NAN), "5.00"),
+        (unit("kg.m2"), "kg·m²"),
+        (unit("N.m/rad3"), "N·m/rad³"),
+    ],
+)
 def test_numbers(made: str, text: str) -> None:
     assert made == text
 
 
 def test_intervals_share_a_power_of_ten() -> None:
     assert interval(0.0017743, 0.0017166, 0.001832, "N.m/rad") == {
-        "value": "1.774", "low": "1.717", "high": "1.832", "unit": "10⁻³ N·m/rad"}
+        "value": "1.774",
+        "low": "1.717",
+        "high": "1.832",
+        "unit": "10⁻³ N·m/rad",
+    }
     assert interval(1.8, None, NAN, "s") == {"value": "1.800", "low": "–", "high": "–", "unit": "s"}
     assert interval(NAN, 0.0, 1.0, "s")["value"] == "–"

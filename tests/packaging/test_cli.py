@@ -15,8 +15,13 @@ from workspace import PACKAGES
 
 
 def hannes(*words: str, **options: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "hannes_bringup.cli", *words], capture_output=True, text=True,
-                          timeout=60, **options)
+    return subprocess.run(
+        [sys.executable, "-m", "hannes_bringup.cli", *words],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        **options,
+    )
 
 
 def test_help_lists_every_subcommand_and_imports_none() -> None:
@@ -31,7 +36,17 @@ def test_help_lists_every_subcommand_and_imports_none() -> None:
     for command in COMMANDS:
         assert re.search(rf"^\s+{command.name}\s", answer.stdout, re.MULTILINE), command.name
     loaded = set(answer.stderr.split("LOADED")[1].split())
-    assert not loaded & {"numpy", "rclpy", "mujoco", "numba", "sklearn", "scipy", "matplotlib", "rosbags", "pandas"}
+    assert not loaded & {
+        "numpy",
+        "rclpy",
+        "mujoco",
+        "numba",
+        "sklearn",
+        "scipy",
+        "matplotlib",
+        "rosbags",
+        "pandas",
+    }
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=[command.name for command in COMMANDS])
@@ -114,7 +129,9 @@ def test_without_ros_the_ros_commands_say_what_to_do() -> None:
 
 def test_run_knows_every_executable_of_the_workspace() -> None:
     declared = {
-        name: package.name for package in PACKAGES.values() for name in package.entry_points
+        name: package.name
+        for package in PACKAGES.values()
+        for name in package.entry_points
         if name not in ("hannes", "hannes_ros2")
     }
     assert declared == NODES

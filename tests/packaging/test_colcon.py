@@ -28,8 +28,14 @@ pytestmark = pytest.mark.slow
 
 
 def colcon(*words: str, **options: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "colcon", *words], capture_output=True, text=True,
-                          stdin=subprocess.DEVNULL, timeout=280, **options)
+    return subprocess.run(
+        [sys.executable, "-m", "colcon", *words],
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+        timeout=280,
+        **options,
+    )
 
 
 @pytest.fixture(scope="session")
@@ -55,15 +61,22 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def overlay(workspace: Path) -> dict[str, str]:
     """The environment after `source install/setup.bash`."""
-    answer = subprocess.run(["bash", "-c", "source install/setup.bash && env -0"], cwd=workspace,
-                            capture_output=True, text=True, check=True)
+    answer = subprocess.run(
+        ["bash", "-c", "source install/setup.bash && env -0"],
+        cwd=workspace,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     return dict(pair.split("=", 1) for pair in answer.stdout.split("\0") if "=" in pair)
 
 
 @pytest.fixture
 def sourced(overlay: dict[str, str], ros_environment: dict[str, str]) -> dict[str, str]:
     """The same, on the test's own domain."""
-    return overlay | {name: ros_environment[name] for name in ("ROS_DOMAIN_ID", "ROS_LOG_DIR", "PYTHONUNBUFFERED")}
+    return overlay | {
+        name: ros_environment[name] for name in ("ROS_DOMAIN_ID", "ROS_LOG_DIR", "PYTHONUNBUFFERED")
+    }
 
 
 def test_colcon_sees_ros_packages(tmp_path: Path) -> None:
@@ -108,8 +121,14 @@ def test_node_runs_and_ends_quietly(
     """`ros2 run PACKAGE EXECUTABLE` for a second, then SIGINT: exit code 0 and no traceback."""
     words = [word.format(bag=bag, folder=tmp_path) for word in NEEDED.get(executable, [])]
     command = ["run", package, executable, "--ros-args", *words]
-    child = subprocess.Popen([sys.executable, "-m", "hannes_bringup.ros2_standin", *command], env=sourced,
-                             cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    child = subprocess.Popen(
+        [sys.executable, "-m", "hannes_bringup.ros2_standin", *command],
+        env=sourced,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
     try:
         wait_for_node(child, sourced)
         child.send_signal(signal.SIGINT)
@@ -149,8 +168,9 @@ def wait_for_node(child: subprocess.Popen[str], environment: dict[str, str]) -> 
 @pytest.mark.ros
 def test_unknown_parameter_is_one_line(workspace: Path, sourced: dict[str, str]) -> None:
     file = workspace / "install" / "hannes_sim" / "lib" / "hannes_sim" / "hand_sim"
-    answer = subprocess.run([file, "--ros-args", "-p", "wibble:=3"], env=sourced, capture_output=True, text=True,
-                            timeout=60)
+    answer = subprocess.run(
+        [file, "--ros-args", "-p", "wibble:=3"], env=sourced, capture_output=True, text=True, timeout=60
+    )
     assert answer.returncode == 2
     assert re.search("wibble", answer.stderr) and "Traceback" not in answer.stderr
 

@@ -33,22 +33,31 @@ def is_node_file(package: Package, name: str) -> bool:
 
 
 def test_every_package_of_the_house_is_there() -> None:
-    assert set(PACKAGES) >= {f"hannes_{part}" for part in
-                             ("description", "sim", "control", "bags", "ros", "stiffness", "lab", "bringup")}
+    assert set(PACKAGES) >= {
+        f"hannes_{part}"
+        for part in ("description", "sim", "control", "bags", "ros", "stiffness", "lab", "bringup")
+    }
 
 
 @ALL
 def test_package_xml_and_setup_cfg_say_the_same(package: Package) -> None:
     metadata, manifest = package.config["metadata"], package.manifest
     assert manifest.get("format") == "3"
-    for key, tag in (("name", "name"), ("version", "version"), ("description", "description"), ("license", "license"),
-                     ("maintainer", "maintainer")):
+    for key, tag in (
+        ("name", "name"),
+        ("version", "version"),
+        ("description", "description"),
+        ("license", "license"),
+        ("maintainer", "maintainer"),
+    ):
         assert metadata[key] == manifest.findtext(tag), f"{package.name}: {tag}"
     assert metadata["maintainer_email"] == manifest.find("maintainer").get("email")
     assert manifest.findtext("export/build_type") == "ament_python"
     own = {name for name in package.requirements if name in PACKAGES}
     outside = package.requirements - own
-    assert outside <= set(ROSDEP_KEYS), f"name the rosdep keys in tests/workspace.py: {outside - set(ROSDEP_KEYS)}"
+    assert outside <= set(ROSDEP_KEYS), (
+        f"name the rosdep keys in tests/workspace.py: {outside - set(ROSDEP_KEYS)}"
+    )
     keys = {ROSDEP_KEYS[name] for name in outside} - {None}
     depends = package.depends("exec_depend")
     assert depends - ROS_PACKAGES == own | keys
@@ -131,16 +140,23 @@ def test_entry_points_exist(package: Package) -> None:
 def test_executables_of_the_nodes() -> None:
     declared = {(package.name, name) for package in PACKAGES.values() for name in package.entry_points}
     assert declared >= {
-        ("hannes_sim", "hand_sim"), ("hannes_control", "motor_controller"), ("hannes_control", "emg_reference"),
-        ("hannes_control", "emg_source"), ("hannes_bags", "recorder"), ("hannes_bags", "player"),
-        ("hannes_stiffness", "stiffness_classifier"), ("hannes_bringup", "hannes"),
+        ("hannes_sim", "hand_sim"),
+        ("hannes_control", "motor_controller"),
+        ("hannes_control", "emg_reference"),
+        ("hannes_control", "emg_source"),
+        ("hannes_bags", "recorder"),
+        ("hannes_bags", "player"),
+        ("hannes_stiffness", "stiffness_classifier"),
+        ("hannes_bringup", "hannes"),
     }
 
 
 def test_the_core_is_importable_without_ros() -> None:
     """Files that are no nodes load where there is no rclpy at all."""
     modules = [
-        ".".join((package.name, *file.relative_to(package.module).with_suffix("").parts)).removesuffix(".__init__")
+        ".".join((package.name, *file.relative_to(package.module).with_suffix("").parts)).removesuffix(
+            ".__init__"
+        )
         for package in PACKAGES.values()
         for file in package.files
         if not is_node_file(package, file.name)

@@ -36,7 +36,14 @@ def test_everything_that_is_declared_is_installed_and_pinned(tool: ModuleType) -
     declared = set().union(*(package.requirements for package in PACKAGES.values())) - set(PACKAGES)
     wanted = names(tool.requirements_lines(apt_ros=False))
     assert declared <= wanted
-    assert {"pytest", "ruff", "mypy", "colcon-core", "ros-jazzy-rclpy", "ros-jazzy-common-interfaces"} <= wanted
+    assert {
+        "pytest",
+        "ruff",
+        "mypy",
+        "colcon-core",
+        "ros-jazzy-rclpy",
+        "ros-jazzy-common-interfaces",
+    } <= wanted
     assert wanted <= set(pins(tool.constraints_text(apt_ros=False)))
 
 
@@ -76,8 +83,12 @@ def test_the_stamp_changes_with_the_requirements(tool: ModuleType, tmp_path: Pat
 
 def run_tool(tmp_path: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     variables = {name: value for name, value in os.environ.items() if name not in ("ROS_DISTRO", "PYTHON")}
-    return subprocess.run([sys.executable, str(TOOL)], capture_output=True, text=True,
-                          env={**variables, "VENV": str(tmp_path / "venv"), **environment})
+    return subprocess.run(
+        [sys.executable, str(TOOL)],
+        capture_output=True,
+        text=True,
+        env={**variables, "VENV": str(tmp_path / "venv"), **environment},
+    )
 
 
 def script(folder: Path, name: str, text: str) -> str:
@@ -116,7 +127,9 @@ def test_a_jazzy_that_does_not_import_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("system", "apt_ros"), [("true", False), ("false", True)])
-def test_the_two_kinds_of_ros_are_never_mixed(tool: ModuleType, tmp_path: Path, system: str, apt_ros: bool) -> None:
+def test_the_two_kinds_of_ros_are_never_mixed(
+    tool: ModuleType, tmp_path: Path, system: str, apt_ros: bool
+) -> None:
     (tmp_path / "bin").mkdir()
     script(tmp_path / "bin", "python", "echo 3.12")
     (tmp_path / "pyvenv.cfg").write_text(f"include-system-site-packages = {system}\n")
@@ -135,6 +148,8 @@ def test_makefile_and_ci_run_the_tests() -> None:
     ci = (root / ".ci" / "run").read_text()
     assert os.access(root / ".ci" / "run", os.X_OK)
     assert "make test" in ci and "make check" in ci
-    help_text = subprocess.run(["make", "-s", "help"], cwd=root, capture_output=True, text=True, check=True).stdout
+    help_text = subprocess.run(
+        ["make", "-s", "help"], cwd=root, capture_output=True, text=True, check=True
+    ).stdout
     for target in ("setup", "demo", "test", "check", "bench", "build"):
         assert f"make {target} " in help_text

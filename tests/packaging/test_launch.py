@@ -32,7 +32,13 @@ def test_arguments_are_declared_with_descriptions() -> None:
 def test_the_graph() -> None:
     plan = read_launch_file(LAUNCH, {"clock": "lockstep", "object": "soft", "model": "/tmp/a.yaml"}, share)
     nodes = {node.executable: node for node in plan.nodes}
-    assert set(nodes) == {"hand_sim", "motor_controller", "emg_reference", "emg_source", "stiffness_classifier"}
+    assert set(nodes) == {
+        "hand_sim",
+        "motor_controller",
+        "emg_reference",
+        "emg_source",
+        "stiffness_classifier",
+    }
     assert all(NODES[name] == node.package for name, node in nodes.items())
     for node in nodes.values():
         assert "__ns:=/hannes" in node.arguments
@@ -81,8 +87,25 @@ def test_substitutions_conditions_and_remaps(tmp_path: Path) -> None:
     )  # fmt: skip
     (node,) = read_launch_file(path, {"who": "b"}, share).nodes
     assert node.name == "b_node"
-    assert node.arguments == ("--flag", "b", "--ros-args", "-r", "__node:=b_node", "-r", "__ns:=/n", "-p", "count:=3",
-                              "-p", 'text:="b"', "-p", "yes:=true", "-p", "list:=[1.5, 2.0]", "-r", "x:=/y")
+    assert node.arguments == (
+        "--flag",
+        "b",
+        "--ros-args",
+        "-r",
+        "__node:=b_node",
+        "-r",
+        "__ns:=/n",
+        "-p",
+        "count:=3",
+        "-p",
+        'text:="b"',
+        "-p",
+        "yes:=true",
+        "-p",
+        "list:=[1.5, 2.0]",
+        "-r",
+        "x:=/y",
+    )
 
 
 @pytest.mark.parametrize(
@@ -125,7 +148,9 @@ def prefix_with(folder: Path, package: str, **scripts: str) -> dict[str, str]:
 
 def test_run_finds_executables_as_ros2_run_does(tmp_path: Path) -> None:
     environment = prefix_with(tmp_path, "some_package", hello="print('hello')\n")
-    assert find_command("some_package", "hello", environment) == [str(tmp_path / "lib" / "some_package" / "hello")]
+    assert find_command("some_package", "hello", environment) == [
+        str(tmp_path / "lib" / "some_package" / "hello")
+    ]
     with pytest.raises(HannesError, match="valid are hello"):
         find_command("some_package", "bye", environment)
     with pytest.raises(HannesError, match="No package"):
@@ -135,8 +160,12 @@ def test_run_finds_executables_as_ros2_run_does(tmp_path: Path) -> None:
 def test_run_becomes_the_executable(tmp_path: Path) -> None:
     environment = prefix_with(tmp_path, "some_package", echo="import sys; print(sys.argv[1:]); sys.exit(7)")
     words = ["run", "some_package", "echo", "--ros-args", "-p", "a:=1"]
-    answer = subprocess.run([sys.executable, "-m", "hannes_bringup.ros2_standin", *words], env=environment,
-                            capture_output=True, text=True)
+    answer = subprocess.run(
+        [sys.executable, "-m", "hannes_bringup.ros2_standin", *words],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
     assert answer.returncode == 7
     assert answer.stdout.strip() == "['--ros-args', '-p', 'a:=1']"
 
@@ -168,10 +197,17 @@ def start_graph(tmp_path: Path, *executables: str) -> subprocess.Popen[str]:
     environment = prefix_with(prefix, "some_package", good=GOOD, stubborn=STUBBORN, bad="raise SystemExit(3)")
     launch = prefix / "share" / "some_package" / "launch"
     launch.mkdir(parents=True)
-    nodes = [{"pkg": "some_package", "exec": name, "name": f"{name}{i}"} for i, name in enumerate(executables)]
+    nodes = [
+        {"pkg": "some_package", "exec": name, "name": f"{name}{i}"} for i, name in enumerate(executables)
+    ]
     write(launch, *({"node": node} for node in nodes))
-    return subprocess.Popen([sys.executable, "-c", IMPATIENT, "launch", "some_package", "test.launch.yaml"],
-                            env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [sys.executable, "-c", IMPATIENT, "launch", "some_package", "test.launch.yaml"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 def assert_gone(stderr: str, count: int) -> None:

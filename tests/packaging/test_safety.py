@@ -61,5 +61,7 @@ def test_reads_nothing_that_runs(file: Path) -> None:
 
 def test_the_check_sees_what_it_should(tmp_path: Path) -> None:
     bad = tmp_path / "bad.py"
-    bad.write_text("import pickle, yaml\nyaml.load('a')\neval('1')\ntry:\n    pass\nexcept Exception:\n    pass\n")
+    bad.write_text(
+        "import pickle, yaml\nyaml.load('a')\neval('1')\ntry:\n    pass\nexcept Exception:\n    pass\n"
+    )
     assert len(offences(bad)) == 4

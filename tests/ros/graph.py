@@ -35,7 +35,11 @@ class NodeProcess:
         rules = [item for key, value in parameters.items() for item in ("-p", f"{key}:={_text(value)}")]
         self.process = subprocess.Popen(
             [sys.executable, "-m", PROGRAMS[name], *arguments, *(["--ros-args", *rules] if rules else [])],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=dict(os.environ))
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=dict(os.environ),
+        )
         self.lines: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -111,8 +115,12 @@ class Peer:
             topics.subscription(self.node, name, callback or kept.append)
 
     def hear_diagnostics(self) -> None:
-        self.node.create_subscription(DiagnosticArray, topics.DIAGNOSTICS_TOPIC,
-                                      lambda m: self.diagnostics.extend(m.status), topics.DIAGNOSTICS_QOS)
+        self.node.create_subscription(
+            DiagnosticArray,
+            topics.DIAGNOSTICS_TOPIC,
+            lambda m: self.diagnostics.extend(m.status),
+            topics.DIAGNOSTICS_QOS,
+        )
 
     def publisher(self, name: str) -> Any:
         if name not in self._publishers:
@@ -137,19 +145,25 @@ class Peer:
     def matched(self, name: str, count: int = 1) -> None:
         """Wait until the signal's publisher here has that many subscribers."""
         publisher = self.publisher(name)
-        self.until(lambda: publisher.get_subscription_count() >= count, what=f"{count} subscriber(s) of {name}")
+        self.until(
+            lambda: publisher.get_subscription_count() >= count, what=f"{count} subscriber(s) of {name}"
+        )
         sleep(0.05)
 
     def status(self, node: str) -> Mapping[str, str]:
         """Latest diagnostics of a node as a dict, with its `message`; empty before the first."""
         for status in reversed(self.diagnostics):
             if status.name.endswith(node):
-                return {"message": status.message, "level": str(status.level[0]),
-                        **{pair.key: pair.value for pair in status.values}}
+                return {
+                    "message": status.message,
+                    "level": str(status.level[0]),
+                    **{pair.key: pair.value for pair in status.values},
+                }
         return {}
 
-    def until_status(self, node: str, condition: Callable[[Mapping[str, str]], bool],
-                     what: str = "") -> Mapping[str, str]:
+    def until_status(
+        self, node: str, condition: Callable[[Mapping[str, str]], bool], what: str = ""
+    ) -> Mapping[str, str]:
         self.until(lambda: bool(self.status(node)) and condition(self.status(node)), what=what)
         return self.status(node)
 

@@ -54,12 +54,15 @@ def test_a_peer_with_a_frame_or_without_velocity_is_understood():
     assert sample == convert.JointSample(0, (1.0,), (), ())
 
 
-@pytest.mark.parametrize(("names", "position"), [(["elbow"], [1.0]), (["motor_pulleX"], [1.0]), ([], []),
-                                                 (["motor_pulley", "motor_pulley"], [1.0, 2.0])])
+@pytest.mark.parametrize(
+    ("names", "position"),
+    [(["elbow"], [1.0]), (["motor_pulleX"], [1.0]), ([], []), (["motor_pulley", "motor_pulley"], [1.0, 2.0])],
+)
 def test_other_joints_are_refused(names, position):
     with pytest.raises(HannesError, match="expected \\['motor_pulley'\\]"):
-        convert.MOTOR_STATE.decode(serialize_message(JointState(name=names, position=position,
-                                                                velocity=position, effort=position)))
+        convert.MOTOR_STATE.decode(
+            serialize_message(JointState(name=names, position=position, velocity=position, effort=position))
+        )
 
 
 def test_other_lengths_are_refused():

@@ -62,7 +62,11 @@ def test_join_pairs_the_newest_until_the_first_answer_and_by_order_afterwards():
         join.put(1, f"current {k}")
     for k in (9, 10):
         join.put(0, f"state {k}")
-    assert [join.take(), join.take(), join.take()] == [["state 9", "current 9"], ["state 10", "current 10"], None]
+    assert [join.take(), join.take(), join.take()] == [
+        ["state 9", "current 9"],
+        ["state 10", "current 10"],
+        None,
+    ]
     for k in (11, 11):
         join.put(1, f"current {k}")
     join.rejoin()

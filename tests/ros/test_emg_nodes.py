@@ -25,12 +25,24 @@ def values(peer, name: str) -> list[float]:
 def test_source_follows_the_stamps_in_lockstep(peer):
     peer.hear(*EMG)
     emg = synthesise(SyntheticEmg(close=0.2, hold=0.1, open=0.2, rest=0.2), seed=7)
-    with processes(NodeProcess("emg_source", clock="lockstep", seed=7, close_time=0.2, hold_time=0.1, open_time=0.2,
-                               rest_time=0.2)):
+    with processes(
+        NodeProcess(
+            "emg_source",
+            clock="lockstep",
+            seed=7,
+            close_time=0.2,
+            hold_time=0.1,
+            open_time=0.2,
+            rest_time=0.2,
+        )
+    ):
         peer.matched("encoder_position")
         for tick, count in ((0, 1), (3, 1), (4, 2), (500, 151), (1200, 361)):
             peer.say("encoder_position", state(tick))
-            peer.until(lambda count=count: all(len(peer.heard[name]) >= count for name in EMG), what=f"{count} samples")
+            peer.until(
+                lambda count=count: all(len(peer.heard[name]) >= count for name in EMG),
+                what=f"{count} samples",
+            )
             peer.spin(0.05)
             assert [len(peer.heard[name]) for name in EMG] == [count, count]
     n = emg.flexor.size
@@ -74,12 +86,18 @@ def test_reference_answers_each_tick_with_the_samples_until_then(peer):
                 peer.say("emg_extensor", convert.float64_bytes(emg.extensor[sent]))
                 peer.say("emg_flexor", convert.float64_bytes(emg.flexor[sent]))
                 sent += 1
-            peer.until(lambda n=tick // 4 + 1: len(peer.heard["reference_position"]) >= n, what=f"tick {tick}")
+            peer.until(
+                lambda n=tick // 4 + 1: len(peer.heard["reference_position"]) >= n, what=f"tick {tick}"
+            )
         # a repeated reading gets the same answer again
         peer.say("encoder_position", state(tick))
-        peer.until(lambda: len(peer.heard["reference_position"]) == ticks // 4 + 1, what="the repeated answer")
+        peer.until(
+            lambda: len(peer.heard["reference_position"]) == ticks // 4 + 1, what="the repeated answer"
+        )
     answers = values(peer, "reference_position")
-    np.testing.assert_allclose(answers[:-1], [expected[t * 300 // 1000] for t in range(0, ticks, 4)], atol=1e-12)
+    np.testing.assert_allclose(
+        answers[:-1], [expected[t * 300 // 1000] for t in range(0, ticks, 4)], atol=1e-12
+    )
     assert answers[-1] == answers[-2] > 0.0
 
 

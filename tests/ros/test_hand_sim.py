@@ -30,7 +30,9 @@ def test_lockstep_advances_one_tick_for_one_voltage(peer):
     assert last.position[0] > 0.1
     assert last.velocity[0] > 0.0
     assert last.effort[0] == pytest.approx(0.01745 * 19 * convert.float64_value(currents[-1]), rel=0.02)
-    fingers = [convert.JointCodec(JOINT_NAMES, effort=False).decode(data) for data in peer.heard["joint_positions"]]
+    fingers = [
+        convert.JointCodec(JOINT_NAMES, effort=False).decode(data) for data in peer.heard["joint_positions"]
+    ]
     assert [sample.stamp_ns for sample in fingers] == [k * 10_000_000 for k in range(5)]
     assert len(peer.heard["grip_force"]) == 5
 
@@ -76,7 +78,9 @@ def test_lockstep_repeats_the_reading_to_whom_was_found_too_late_for_the_current
         peer.until(lambda: len(late) > 0, what="the reading again")
         assert [convert.MOTOR_STATE.decode(data).stamp_ns for data in states[:2]] == [0, 0]
         say_voltage(peer, 1.0)
-        peer.until(lambda: convert.MOTOR_STATE.decode(states[-1]).stamp_ns == 1_000_000, what="the loop going on")
+        peer.until(
+            lambda: convert.MOTOR_STATE.decode(states[-1]).stamp_ns == 1_000_000, what="the loop going on"
+        )
 
 
 def test_real_time_gives_zero_volt_when_commands_stop(peer):
@@ -105,7 +109,9 @@ def test_real_time_gives_zero_volt_when_commands_stop(peer):
 def test_noise_is_seeded_and_on_current_and_effort(peer):
     peer.hear("encoder_position", "motor_current")
     states, currents = peer.heard["encoder_position"], peer.heard["motor_current"]
-    with processes(NodeProcess("hand_sim", clock="lockstep", duration=0.02, current_noise=0.1, seed=3)) as (sim,):
+    with processes(NodeProcess("hand_sim", clock="lockstep", duration=0.02, current_noise=0.1, seed=3)) as (
+        sim,
+    ):
         peer.publisher("motor_voltage")
         for tick in range(20):
             peer.until(lambda tick=tick: len(states) == len(currents) == tick + 1)

@@ -51,7 +51,9 @@ def run_graph(peer, *nodes: NodeProcess) -> dict[str, np.ndarray]:
         peer.until(lambda: nodes[-1].process.poll() is not None, what="the end of hand_sim")
         assert nodes[-1].wait() == 0, nodes[-1].output
         # The peer is slower than the graph, but nothing may be lost.
-        peer.until(lambda: all(len(peer.heard[name]) >= expected[name] for name in expected), what="all messages")
+        peer.until(
+            lambda: all(len(peer.heard[name]) >= expected[name] for name in expected), what="all messages"
+        )
         for node in nodes[:-1]:
             node.send(signal.SIGINT)
         assert [node.wait() for node in nodes[:-1]] == [0] * (len(nodes) - 1)
@@ -65,8 +67,9 @@ def assert_equal(heard: dict[str, np.ndarray], expected: Rollout) -> None:
         np.testing.assert_array_equal(heard[name], expected.signal(name), err_msg=name)
 
 
-@pytest.mark.parametrize(("kind", "plant"), [("processes", "reduced"), ("composed", "reduced"),
-                                             ("composed", "mujoco")])
+@pytest.mark.parametrize(
+    ("kind", "plant"), [("processes", "reduced"), ("composed", "reduced"), ("composed", "mujoco")]
+)
 def test_simulator_and_controller_equal_the_rollout_bit_for_bit_twice(peer, kind, plant):
     peer.hear(*SIGNALS)
     # One more subscriber than the loop needs: the peer must not miss the first tick.
@@ -77,8 +80,9 @@ def test_simulator_and_controller_equal_the_rollout_bit_for_bit_twice(peer, kind
         if kind == "processes":
             nodes = [NodeProcess("motor_controller", **control), NodeProcess("hand_sim", **sim)]
         else:
-            parameters = {f"hand_sim:{k}": v for k, v in sim.items()} | {f"motor_controller:{k}": v
-                                                                      for k, v in control.items()}
+            parameters = {f"hand_sim:{k}": v for k, v in sim.items()} | {
+                f"motor_controller:{k}": v for k, v in control.items()
+            }
             nodes = [NodeProcess("composed", "--nodes", "hand_sim,motor_controller", **parameters)]
         runs.append(run_graph(peer, *nodes))
     for name, values in runs[0].items():
@@ -94,8 +98,12 @@ def test_the_whole_chain_from_emg_equals_the_rollout(peer, kind):
     samples = [k * 300 // 1000 for k in range(TICKS)]  # the last sample with a time <= k ms
     reference = emg_reference(emg.flexor, emg.extensor).reference[samples]
     assert reference[-1] > 1.0
-    own = {"hand_sim": {"duration": SECONDS, "subscribers": 4}, "emg_source": {"seed": 5},
-           "emg_reference": {"subscribers": 2}, "motor_controller": {"subscribers": 2}}
+    own = {
+        "hand_sim": {"duration": SECONDS, "subscribers": 4},
+        "emg_source": {"seed": 5},
+        "emg_reference": {"subscribers": 2},
+        "motor_controller": {"subscribers": 2},
+    }
     order = ("emg_source", "emg_reference", "motor_controller", "hand_sim")
     if kind == "processes":
         nodes = [NodeProcess(name, clock="lockstep", **own[name]) for name in order]
@@ -117,8 +125,11 @@ def test_a_killed_controller_stops_time_and_its_successor_goes_on(peer):
         peer.until(lambda: len(peer.heard["motor_voltage"]) > 500, what="commands")
         first.send(signal.SIGKILL)
         # The peer is slower than the graph: the report of the stall can come before what was sent ahead of it.
-        status = peer.until_status("hand_sim", lambda s: s["message"].startswith("waiting")
-                                   and last_stamp(peer) == int(s["tick"]) * 1_000_000, "the stall and its last tick")
+        status = peer.until_status(
+            "hand_sim",
+            lambda s: s["message"].startswith("waiting") and last_stamp(peer) == int(s["tick"]) * 1_000_000,
+            "the stall and its last tick",
+        )
         assert int(status["stalls"]) >= 1
         stopped = len(peer.heard["encoder_position"])
         peer.spin(0.3)
@@ -126,4 +137,7 @@ def test_a_killed_controller_stops_time_and_its_successor_goes_on(peer):
         with processes(NodeProcess("motor_controller", **control)):
             peer.until(lambda: len(peer.heard["encoder_position"]) > stopped + 300, what="the loop going on")
         stamps = columns(peer)["stamp_ns"]
-        assert set(np.diff(stamps)) <= {0, 1_000_000}  # no tick is skipped; one may be repeated to the newcomer
+        assert set(np.diff(stamps)) <= {
+            0,
+            1_000_000,
+        }  # no tick is skipped; one may be repeated to the newcomer

@@ -161,7 +161,12 @@ def test_hannes_motor_switches_a_running_controller(peer):
     with processes(NodeProcess(NAME, clock="lockstep", autostart=False)):
         announce(peer)
         name = ("--node", f"{peer.node.get_namespace().rstrip('/')}/{NAME}")
-        for wanted, state in (((), "unconfigured"), (("on",), "active"), (("off",), "inactive"), (("on",), "active")):
+        for wanted, state in (
+            ((), "unconfigured"),
+            (("on",), "active"),
+            (("off",), "inactive"),
+            (("on",), "active"),
+        ):
             asked = motor(*wanted, *name)
             assert asked.returncode == 0, asked.stderr
             assert json.loads(asked.stdout)["state"] == state
@@ -211,10 +216,13 @@ def test_killed_or_stopped_controller_leaves_zero_volt(peer):
     peer.hear_diagnostics()
     sim = NodeProcess("hand_sim", clock="realtime", command_timeout_ms=60)
     # The period is long because two real-time loops and the test share this machine with others.
-    first = NodeProcess(NAME, clock="realtime", reference="half_sine", period=0.005, pause_limit_ms=400,
-                        state_timeout_ms=1000)
+    first = NodeProcess(
+        NAME, clock="realtime", reference="half_sine", period=0.005, pause_limit_ms=400, state_timeout_ms=1000
+    )
     with processes(sim, first):
-        running = peer.until_status("hand_sim", lambda s: s["message"].startswith("running"), "a driven motor")
+        running = peer.until_status(
+            "hand_sim", lambda s: s["message"].startswith("running"), "a driven motor"
+        )
         before = int(running["command_timeouts"])
         first.send(signal.SIGSTOP)
         stopped = peer.until_status("hand_sim", without_command, "the timeout")

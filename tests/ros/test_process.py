@@ -12,7 +12,12 @@ import pytest
 from graph import PROGRAMS, NodeProcess, processes
 
 NODES = [name for name in PROGRAMS if name != "composed"]
-READY = {"hand_sim": "waiting for", "motor_controller": "", "emg_source": "synthetic EMG", "emg_reference": ""}
+READY = {
+    "hand_sim": "waiting for",
+    "motor_controller": "",
+    "emg_source": "synthetic EMG",
+    "emg_reference": "",
+}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -48,7 +53,10 @@ def importing(node: NodeProcess) -> bool:
 
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.3, 0.6])
 def test_early_signals_end_quietly(ros_environment, delay):
-    nodes = [NodeProcess("motor_controller", clock="lockstep"), NodeProcess("emg_reference", clock="lockstep")]
+    nodes = [
+        NodeProcess("motor_controller", clock="lockstep"),
+        NodeProcess("emg_reference", clock="lockstep"),
+    ]
     with processes(*nodes):
         for node, number in zip(nodes, (signal.SIGINT, signal.SIGTERM), strict=True):
             end = monotonic() + 30.0
@@ -62,19 +70,27 @@ def test_early_signals_end_quietly(ros_environment, delay):
         assert codes == [0, 0]
 
 
-@pytest.mark.parametrize(("name", "arguments", "parameters", "message"), [
-    ("hand_sim", (), {"modle": "x"}, "Node 'hand_sim' has no parameter 'modle'; valid are model, plant,"),
-    ("hand_sim", (), {"model": "nobody"}, "No model 'nobody'"),
-    ("hand_sim", (), {"object_size": 0.05}, "need an object"),
-    ("hand_sim", (), {"period": 0.00033}, "not a multiple of the plant's step"),
-    ("motor_controller", (), {"reference": "sinus"}, "'motor_controller' is 'sinus'; valid are topic, half_sine"),
-    ("motor_controller", (), {"period": "fast"}, "it must be a number"),
-    ("emg_reference", (), {"envelope_cutoff": -1.0}, "it must be between 0.1 and 45.0 Hz"),
-    ("emg_reference", ("--verbose",), {}, "Unknown argument '--verbose'"),
-    ("emg_source", ("--ros-args", "--params-file", "/nowhere.yaml"), {}, "ROS arguments are not valid"),
-    ("composed", ("--nodes", "hand_sim,foot"), {}, "There is no node 'foot' to compose"),
-    ("composed", ("--nodes", "hand_sim"), {"foot:size": 1}, "There is no node 'foot' in this process"),
-])
+@pytest.mark.parametrize(
+    ("name", "arguments", "parameters", "message"),
+    [
+        ("hand_sim", (), {"modle": "x"}, "Node 'hand_sim' has no parameter 'modle'; valid are model, plant,"),
+        ("hand_sim", (), {"model": "nobody"}, "No model 'nobody'"),
+        ("hand_sim", (), {"object_size": 0.05}, "need an object"),
+        ("hand_sim", (), {"period": 0.00033}, "not a multiple of the plant's step"),
+        (
+            "motor_controller",
+            (),
+            {"reference": "sinus"},
+            "'motor_controller' is 'sinus'; valid are topic, half_sine",
+        ),
+        ("motor_controller", (), {"period": "fast"}, "it must be a number"),
+        ("emg_reference", (), {"envelope_cutoff": -1.0}, "it must be between 0.1 and 45.0 Hz"),
+        ("emg_reference", ("--verbose",), {}, "Unknown argument '--verbose'"),
+        ("emg_source", ("--ros-args", "--params-file", "/nowhere.yaml"), {}, "ROS arguments are not valid"),
+        ("composed", ("--nodes", "hand_sim,foot"), {}, "There is no node 'foot' to compose"),
+        ("composed", ("--nodes", "hand_sim"), {"foot:size": 1}, "There is no node 'foot' in this process"),
+    ],
+)
 def test_mistakes_are_one_line_and_exit_code_2(ros_environment, name, arguments, parameters, message):
     node = NodeProcess(name, *arguments, **parameters)
     assert node.wait() == 2, node.output
@@ -86,7 +102,12 @@ def test_mistakes_are_one_line_and_exit_code_2(ros_environment, name, arguments,
 def test_help_lists_the_parameters(ros_environment):
     node = NodeProcess("composed", "--help")
     assert node.wait() == 0
-    for text in ("hand_sim: The simulated hand", "object := 'none'", "one of none, soft, rigid", "envelope_cutoff"):
+    for text in (
+        "hand_sim: The simulated hand",
+        "object := 'none'",
+        "one of none, soft, rigid",
+        "envelope_cutoff",
+    ):
         assert text in node.output
 
 
@@ -97,7 +118,8 @@ def test_a_diverging_plant_ends_the_node_with_one_line(ros_environment, tmp_path
         "from hannes_sim.reduced import ReducedPlant\n"
         "class Broken(ReducedPlant):\n"
         "    def advance(self, voltage, steps):\n"
-        "        raise PlantDiverged('The plant diverged at t = 0.001 s (index_mcp).')\n")
+        "        raise PlantDiverged('The plant diverged at t = 0.001 s (index_mcp).')\n"
+    )
     node = NodeProcess("hand_sim", plant=f"{plant}:Broken")
     assert node.wait() == 2
     assert "hand_sim" in node.output or "sim_node" in node.output
@@ -107,8 +129,10 @@ def test_a_diverging_plant_ends_the_node_with_one_line(ros_environment, tmp_path
 
 def test_diagnostics_tell_rate_age_and_counts(peer):
     peer.hear_diagnostics()
-    with processes(NodeProcess("hand_sim", clock="lockstep", duration=1e5),
-                   NodeProcess("motor_controller", clock="lockstep", reference="half_sine")):
+    with processes(
+        NodeProcess("hand_sim", clock="lockstep", duration=1e5),
+        NodeProcess("motor_controller", clock="lockstep", reference="half_sine"),
+    ):
         sim = peer.until_status("hand_sim", lambda s: float(s["rate_hz"]) > 100.0, "a rate")
         control = peer.until_status("motor_controller", lambda s: float(s["rate_hz"]) > 100.0, "a rate")
     assert {"input_age_s", "missed_cycles", "command_timeouts", "rejected_commands", "tick"} <= set(sim)
@@ -118,7 +142,11 @@ def test_diagnostics_tell_rate_age_and_counts(peer):
 
 @pytest.mark.parametrize("code", [0, 2])
 def test_a_process_that_is_stuck_with_the_interpreter_s_lock_leaves_by_its_deadline(code: int) -> None:
-    stuck = (f"import ctypes; from hannes_ros.leave import leave_within; print('said'); leave_within(0.3, {code}); "
-             "ctypes.PyDLL(None).sleep(60)")
-    answer = subprocess.run([sys.executable, "-c", stuck], capture_output=True, text=True, timeout=30, check=False)
+    stuck = (
+        f"import ctypes; from hannes_ros.leave import leave_within; print('said'); leave_within(0.3, {code}); "
+        "ctypes.PyDLL(None).sleep(60)"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", stuck], capture_output=True, text=True, timeout=30, check=False
+    )
     assert (answer.returncode, answer.stdout) == (code, "said\n"), answer.stderr

@@ -188,11 +188,14 @@ def test_no_strength_within_the_bounds_upsets_the_integration(name: str, grasp: 
     kind = load_effect(name)
     reference = half_sine(period=1.2)[:1200]
     for factor in (1.0, 16.0, 1e9):
-        values = {p.name: float(np.clip(p.typical * (factor if p.vanishing is not None else 1.0), p.lower, p.upper))
-                  for p in kind.parameters}
+        values = {
+            p.name: float(np.clip(p.typical * (factor if p.vanishing is not None else 1.0), p.lower, p.upper))
+            for p in kind.parameters
+        }
         model = Model.load("nominal").with_effect(kind.entry(values))
         fine, coarse = (
             rollout(make_plant(model, OBJECTS[grasp], dt=dt), DoublePID.of_model(model.parameters), reference)
-            for dt in (0.125e-3, 0.25e-3))
+            for dt in (0.125e-3, 0.25e-3)
+        )
         apart = np.sqrt(np.mean((fine.motor_current - coarse.motor_current) ** 2))
         assert apart < 0.02, (factor, apart)

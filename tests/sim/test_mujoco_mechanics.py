@@ -24,15 +24,22 @@ from hannes_sim.objects import RIGID_DYNAMOMETER, SOFT_BALL, GraspObject
 PARAMETERS = load_parameters("hannes")
 
 FRICTIONLESS = {"friction.coulomb": 0.0, "joints.friction_tension": 0.0, "carts.friction": 0.0}
-UNSPRUNG = {f"springs.{digit}_preload": 0.0 for digit in DIGITS} | {f"springs.{digit}_rate": 1e-9 for digit in DIGITS}
+UNSPRUNG = {f"springs.{digit}_preload": 0.0 for digit in DIGITS} | {
+    f"springs.{digit}_rate": 1e-9 for digit in DIGITS
+}
 WEIGHTLESS = {"gravity.palmar": 0.0, "gravity.radial": 0.0, "gravity.distal": 0.0}
 
 
 class Bench:
     """A hand whose wire is pulled with a given force."""
 
-    def __init__(self, parameters: ParameterSet = PARAMETERS, grasp: GraspObject | None = None, dt: float = 0.25e-3,
-                 **variant: object) -> None:
+    def __init__(
+        self,
+        parameters: ParameterSet = PARAMETERS,
+        grasp: GraspObject | None = None,
+        dt: float = 0.25e-3,
+        **variant: object,
+    ) -> None:
         # The real motor's back-EMF keeps it from running away; here a viscous friction does.
         parameters = parameters.with_values({"friction.viscous": 0.002})
         spec = build_spec(parameters, variant, grasp)
@@ -101,11 +108,15 @@ def test_a_stop_gives_way_by_moment_over_stiffness() -> None:
     stop = PARAMETERS.value("joints.stop_stiffness")
     for joint in (joint for digit in DIGITS for joint in joints_of(digit)):
         # The stop carries what the wire's moment exceeds the return wire's, give or take the dry friction.
-        wire = sum(-bench.tension(w) * float(bench.data.ten_J.flat[at]) for w, at in wire_entries(bench, joint))
+        wire = sum(
+            -bench.tension(w) * float(bench.data.ten_J.flat[at]) for w, at in wire_entries(bench, joint)
+        )
         carried = wire + float(bench.data.joint(joint).qfrc_passive[0])
         friction = float(bench.model.dof_frictionloss[bench.model.joint(joint).dofadr[0]])
         assert carried > 5.0 * friction
-        assert stop * (bench.angle(joint) - JOINT_LIMITS[joint].upper) == pytest.approx(carried, abs=friction + 1e-6)
+        assert stop * (bench.angle(joint) - JOINT_LIMITS[joint].upper) == pytest.approx(
+            carried, abs=friction + 1e-6
+        )
 
 
 def wire_entries(bench: Bench, joint: str) -> list[tuple[str, int]]:
@@ -121,7 +132,9 @@ def wire_entries(bench: Bench, joint: str) -> list[tuple[str, int]]:
 
 def test_friction_holds_a_load_for_seconds() -> None:
     """A force below the breakaway moves nothing: the motor by less than 1 um/s, no joint by 0.03 deg/s."""
-    parameters = PARAMETERS.with_values({"friction.coulomb": 0.03, "joints.friction_tension": 3.0} | WEIGHTLESS)
+    parameters = PARAMETERS.with_values(
+        {"friction.coulomb": 0.03, "joints.friction_tension": 3.0} | WEIGHTLESS
+    )
     bench = Bench(parameters)
     bench.pull(20.0, 0.6)
     assert bench.angle("index_mcp") > 0.2
@@ -137,8 +150,9 @@ def test_friction_holds_a_load_for_seconds() -> None:
 
 def test_carts_balance_and_wires_move_joints_by_tension_times_arm() -> None:
     """P14: with F on the master wire, a slave wire has 2F less the cart's spring; finger a gets rb/(ra+rb) of it."""
-    parameters = PARAMETERS.with_values(FRICTIONLESS | WEIGHTLESS | {
-        "pulleys.index_lever": 0.004, "pulleys.middle_lever": 0.006})
+    parameters = PARAMETERS.with_values(
+        FRICTIONLESS | WEIGHTLESS | {"pulleys.index_lever": 0.004, "pulleys.middle_lever": 0.006}
+    )
     # Stiff return springs, so that every joint comes to rest between its stops.
     parameters = parameters.with_values({f"springs.{digit}_rate": 3000.0 for digit in DIGITS})
     bench = Bench(parameters, return_mechanism="torsion_spring")

@@ -21,12 +21,20 @@ from hannes_sim.rollout import Rollout, rollout
 MODEL = Model.load("nominal_mujoco")
 CLOSURE = half_sine()[:2000]
 
-VARIANTS = [{"return_mechanism": mechanism, "transmission": transmission}
-            for mechanism in ("return_wire", "torsion_spring") for transmission in ("wires", "forces")]
+VARIANTS = [
+    {"return_mechanism": mechanism, "transmission": transmission}
+    for mechanism in ("return_wire", "torsion_spring")
+    for transmission in ("wires", "forces")
+]
 
 
-def close(model: Model = MODEL, grasp: GraspObject | None = None, *, dt: float = 0.25e-3,
-          reference: np.ndarray = CLOSURE) -> Rollout:
+def close(
+    model: Model = MODEL,
+    grasp: GraspObject | None = None,
+    *,
+    dt: float = 0.25e-3,
+    reference: np.ndarray = CLOSURE,
+) -> Rollout:
     return rollout(MujocoPlant(model, grasp, dt=dt), DoublePID.of_model(model.parameters), reference)
 
 
@@ -42,7 +50,9 @@ def test_every_variant_closes_and_opens(variant: dict[str, str]) -> None:
 
 
 def test_a_rigid_object_takes_current_and_force_a_soft_one_less() -> None:
-    void, soft, rigid = (close(grasp=g, reference=CLOSURE[:1100]) for g in (None, SOFT_BALL, RIGID_DYNAMOMETER))
+    void, soft, rigid = (
+        close(grasp=g, reference=CLOSURE[:1100]) for g in (None, SOFT_BALL, RIGID_DYNAMOMETER)
+    )
     peak = [np.abs(run.motor_current[300:]).max() for run in (void, soft, rigid)]
     assert peak[0] < 0.3 < peak[1] < 1.0 < 1.8 < peak[2] < 4.6
     assert void.grip_force.max() == 0.0
@@ -87,18 +97,32 @@ def test_a_motor_side_effect_is_the_parameter_that_it_adds_to() -> None:
     assert np.abs(with_effect.encoder_position - close().encoder_position).max() > 0.01
 
 
-
-
 @pytest.fixture(scope="module")
 def constant_effects(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Effects of constant output, one class for each, as a user's own file."""
     path = tmp_path_factory.mktemp("effects") / "constant.py"
     lines = ["from hannes_sim.effect import Effect, EffectParameter", "from hannes_sim import ports", ""]
-    for port in ("TORQUE", "FRICTION", "INERTIA", "LOAD_TORQUE", "LOAD_FRICTION", "LOAD_DAMPING", "SLACK", "COMPLIANCE",
-                 "OBJECT_DAMPING"):
-        lines += [f"{port} = ports.{port}", f"class C{port}(Effect):", f"    name = 'constant_{port.lower()}'",
-                  "    parameters = (EffectParameter('level', 'SI', -10.0, 10.0, typical=0.0, vanishing=0.0),)",
-                  "    @staticmethod", "    def contribute(x, p, s, y):", f"        y[{port}] += p[0]", ""]
+    for port in (
+        "TORQUE",
+        "FRICTION",
+        "INERTIA",
+        "LOAD_TORQUE",
+        "LOAD_FRICTION",
+        "LOAD_DAMPING",
+        "SLACK",
+        "COMPLIANCE",
+        "OBJECT_DAMPING",
+    ):
+        lines += [
+            f"{port} = ports.{port}",
+            f"class C{port}(Effect):",
+            f"    name = 'constant_{port.lower()}'",
+            "    parameters = (EffectParameter('level', 'SI', -10.0, 10.0, typical=0.0, vanishing=0.0),)",
+            "    @staticmethod",
+            "    def contribute(x, p, s, y):",
+            f"        y[{port}] += p[0]",
+            "",
+        ]
     path.write_text("\n".join(lines))
     return str(path)
 
@@ -139,7 +163,9 @@ def load_through(model: Model) -> float:
 
 
 @pytest.mark.parametrize(("port", "level"), [("LOAD_FRICTION", 0.01), ("LOAD_DAMPING", 0.003)])
-def test_load_friction_and_damping_are_felt_at_the_pulley(constant_effects: str, port: str, level: float) -> None:
+def test_load_friction_and_damping_are_felt_at_the_pulley(
+    constant_effects: str, port: str, level: float
+) -> None:
     run = close(constant(constant_effects, port, level), reference=half_sine(period=16.0)[:4000])
     q, v = run.raw[:, R_Q], np.gradient(run.raw[:, R_Q], run.time)
     inside = (q > 3.0) & (q < 8.0)
@@ -150,16 +176,25 @@ def test_load_friction_and_damping_are_felt_at_the_pulley(constant_effects: str,
 def test_inertia_adds_to_the_rotor(constant_effects: str) -> None:
     own = MODEL.parameters.value("motor.armature") * MODEL.parameters.value("gear.ratio") ** 2
     with_effect = close(constant(constant_effects, "INERTIA", own), reference=CLOSURE[:600])
-    doubled = close(MODEL.with_values({"motor.armature": 2.0 * MODEL.parameters.value("motor.armature")}),
-                    reference=CLOSURE[:600])
+    doubled = close(
+        MODEL.with_values({"motor.armature": 2.0 * MODEL.parameters.value("motor.armature")}),
+        reference=CLOSURE[:600],
+    )
     np.testing.assert_allclose(with_effect.encoder_position, doubled.encoder_position, atol=2e-2)
     assert np.abs(with_effect.encoder_position - close(reference=CLOSURE[:600]).encoder_position).max() > 0.05
 
 
 def test_set_is_the_same_as_a_model_with_that_value() -> None:
-    for name, value in (("motor.resistance", 2.0), ("friction.coulomb", 0.02), ("springs.index_preload", 7.0),
-                        ("pulley.radius", 0.0045), ("wires.master_stiffness", 3e4), ("hand.preload", 0.02),
-                        ("hand.stiffness", 0.003), ("hand.coulomb", 0.016)):
+    for name, value in (
+        ("motor.resistance", 2.0),
+        ("friction.coulomb", 0.02),
+        ("springs.index_preload", 7.0),
+        ("pulley.radius", 0.0045),
+        ("wires.master_stiffness", 3e4),
+        ("hand.preload", 0.02),
+        ("hand.stiffness", 0.003),
+        ("hand.coulomb", 0.016),
+    ):
         plant = MujocoPlant(MODEL)
         plant.set(name, value)
         assert plant.get(name) == value
@@ -207,8 +242,13 @@ def test_a_change_between_closures_leaves_the_state_as_it_is() -> None:
     for _ in range(400):
         plant.advance(4.0, 4)
     before = plant.read()
-    for name, factor in (("springs.index_preload", 1.1), ("hand.preload", 1.1), ("object.position", 0.98),
-                         ("object.stiffness", 1.2), ("friction.coulomb", 1.1)):
+    for name, factor in (
+        ("springs.index_preload", 1.1),
+        ("hand.preload", 1.1),
+        ("object.position", 0.98),
+        ("object.stiffness", 1.2),
+        ("friction.coulomb", 1.1),
+    ):
         plant.set(name, factor * plant.get(name))
         joints = [plant.data.joint(joint).qpos[0] for joint in JOINT_NAMES]
         np.testing.assert_array_equal(joints, before.joint_positions)

@@ -39,12 +39,16 @@ def test_the_same_pose_gives_the_same_picture(renderer) -> None:
 
 def test_png_holds_the_picture(tmp_path: Path, renderer) -> None:
     image = renderer.draw(render.OPEN)
-    content = render.save_png(render.side_by_side([image, image]), tmp_path / "deep" / "hand.png").read_bytes()
+    content = render.save_png(
+        render.side_by_side([image, image]), tmp_path / "deep" / "hand.png"
+    ).read_bytes()
     assert content[:8] == b"\x89PNG\r\n\x1a\n"
     assert struct.unpack(">II", content[16:24]) == (320, 120)
     at = content.index(b"IDAT")
-    size = struct.unpack(">I", content[at - 4:at])[0]
-    rows = np.frombuffer(zlib.decompress(content[at + 4:at + 4 + size]), dtype=np.uint8).reshape(120, 1 + 3 * 320)
+    size = struct.unpack(">I", content[at - 4 : at])[0]
+    rows = np.frombuffer(zlib.decompress(content[at + 4 : at + 4 + size]), dtype=np.uint8).reshape(
+        120, 1 + 3 * 320
+    )
     assert np.array_equal(rows[:, 1:481].reshape(120, 160, 3), image)
 
 

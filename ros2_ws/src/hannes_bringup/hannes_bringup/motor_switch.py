@@ -17,8 +17,11 @@ from .visitor import visit
 
 UP = {"unconfigured": Transition.TRANSITION_CONFIGURE, "inactive": Transition.TRANSITION_ACTIVATE}
 DOWN = {"active": Transition.TRANSITION_DEACTIVATE}
-_GOALS = {Transition.TRANSITION_CONFIGURE: "inactive", Transition.TRANSITION_ACTIVATE: "active",
-          Transition.TRANSITION_DEACTIVATE: "inactive"}
+_GOALS = {
+    Transition.TRANSITION_CONFIGURE: "inactive",
+    Transition.TRANSITION_ACTIVATE: "active",
+    Transition.TRANSITION_DEACTIVATE: "inactive",
+}
 _PATIENCE_S = 1.0
 """How long an answer may take before the request counts as lost.
 

@@ -61,17 +61,23 @@ class EmgParameters:
         for item in fields(self):
             value = getattr(self, item.name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise HannesError(f"EMG parameter '{item.name}' is {value}; it must be a finite number of at least 0.")
+                raise HannesError(
+                    f"EMG parameter '{item.name}' is {value}; it must be a finite number of at least 0."
+                )
         for name in ("rate", "full_scale", "envelope_cutoff", "speed", "max_speed", "max_position"):
             if getattr(self, name) == 0.0:
                 raise HannesError(f"EMG parameter '{name}' is 0; it must be positive.")
         if self.envelope_cutoff >= self.rate / 2.0:
-            raise HannesError(f"EMG parameter 'envelope_cutoff' is {self.envelope_cutoff} Hz; it must be below half "
-                              f"the rate, {self.rate / 2.0} Hz.")
+            raise HannesError(
+                f"EMG parameter 'envelope_cutoff' is {self.envelope_cutoff} Hz; it must be below half "
+                f"the rate, {self.rate / 2.0} Hz."
+            )
         for name in ("close_threshold", "open_threshold"):
             if getattr(self, name) < self.dead_band:
-                raise HannesError(f"EMG parameter '{name}' is {getattr(self, name)}; it must be at least the dead "
-                                  f"band, {self.dead_band}.")
+                raise HannesError(
+                    f"EMG parameter '{name}' is {getattr(self, name)}; it must be at least the dead "
+                    f"band, {self.dead_band}."
+                )
 
     def filter(self) -> Array:
         """Second-order section (6,) of the envelope's low-pass: b0 b1 b2 1 a1 a2."""
@@ -102,8 +108,10 @@ def emg_reference(flexor: Array, extensor: Array, parameters: EmgParameters | No
     parameters = parameters or EmgParameters()
     flexor, extensor = np.asarray(flexor, dtype=np.float64), np.asarray(extensor, dtype=np.float64)
     if flexor.ndim != 1 or flexor.shape != extensor.shape:
-        raise HannesError(f"The EMG channels have the shapes {flexor.shape} and {extensor.shape}; they must be 1-D and "
-                          "of the same length.")
+        raise HannesError(
+            f"The EMG channels have the shapes {flexor.shape} and {extensor.shape}; they must be 1-D and "
+            "of the same length."
+        )
     for name, channel in (("flexor", flexor), ("extensor", extensor)):
         bad = np.flatnonzero(~np.isfinite(channel))
         if bad.size:
@@ -111,7 +119,9 @@ def emg_reference(flexor: Array, extensor: Array, parameters: EmgParameters | No
     flexor_envelope, extensor_envelope = envelope(flexor, parameters), envelope(extensor, parameters)
     logic = _Logic(parameters)
     reference, switches = np.empty(flexor.size), []
-    for k, (close, opening) in enumerate(zip(flexor_envelope.tolist(), extensor_envelope.tolist(), strict=True)):
+    for k, (close, opening) in enumerate(
+        zip(flexor_envelope.tolist(), extensor_envelope.tolist(), strict=True)
+    ):
         reference[k] = logic.step(close, opening)
         if logic.switched:
             switches.append(k)
@@ -217,10 +227,14 @@ class EmgRecording:
             return self
         old = round(self.rate)
         if abs(old - self.rate) > 1e-3 * self.rate:
-            raise HannesError(f"The EMG has {self.rate:.3f} Hz, which is no integer; resample it to {rate} Hz first.")
+            raise HannesError(
+                f"The EMG has {self.rate:.3f} Hz, which is no integer; resample it to {rate} Hz first."
+            )
         common = gcd(old, rate)
-        flexor, extensor = (signal.resample_poly(channel, rate // common, old // common)
-                            for channel in (self.flexor, self.extensor))
+        flexor, extensor = (
+            signal.resample_poly(channel, rate // common, old // common)
+            for channel in (self.flexor, self.extensor)
+        )
         return EmgRecording(float(rate), flexor, extensor)
 
 
@@ -250,8 +264,9 @@ class SyntheticEmg:
             value = getattr(self, item.name)
             low = 1 if item.name == "closures" else 0.0
             if not (math.isfinite(value) and value >= low):
-                raise HannesError(f"Synthetic EMG: '{item.name}' is {value}; it must be a finite number of at "
-                                  f"least {low}.")
+                raise HannesError(
+                    f"Synthetic EMG: '{item.name}' is {value}; it must be a finite number of at least {low}."
+                )
 
 
 def synthesise(protocol: SyntheticEmg, seed: int, rate: int = 300) -> EmgRecording:
@@ -265,8 +280,12 @@ def synthesise(protocol: SyntheticEmg, seed: int, rate: int = 300) -> EmgRecordi
     level = protocol.effort
     steps = [(protocol.rest / 2.0, 0.0, 0.0)]
     for _ in range(protocol.closures):
-        steps += [(protocol.close, level, 0.0), (protocol.hold, 0.0, 0.0), (protocol.open, 0.0, level),
-                  (protocol.rest, 0.0, 0.0)]
+        steps += [
+            (protocol.close, level, 0.0),
+            (protocol.hold, 0.0, 0.0),
+            (protocol.open, 0.0, level),
+            (protocol.rest, 0.0, 0.0),
+        ]
         if protocol.cocontraction > 0.0:
             steps += [(protocol.cocontraction, 1.0, 1.0), (protocol.rest, 0.0, 0.0)]
     rng = np.random.default_rng(seed)
@@ -276,7 +295,9 @@ def synthesise(protocol: SyntheticEmg, seed: int, rate: int = 300) -> EmgRecordi
     lead = rate  # the filter's transient is cut off
     channels = []
     for which in (1, 2):
-        activation = np.concatenate([np.full(count, step[which]) for count, step in zip(counts, steps, strict=True)])
+        activation = np.concatenate(
+            [np.full(count, step[which]) for count, step in zip(counts, steps, strict=True)]
+        )
         smooth = np.convolve(activation, ramp / ramp.sum(), mode="same")
         carrier = signal.sosfilt(band, rng.standard_normal(smooth.size + lead))[lead:]
         carrier /= np.mean(np.abs(carrier))
@@ -284,7 +305,9 @@ def synthesise(protocol: SyntheticEmg, seed: int, rate: int = 300) -> EmgRecordi
     return EmgRecording(float(rate), channels[0], channels[1])
 
 
-def read_emg_csv(path: str | Path, close: str = "close", opening: str = "open", time: str = "t_s") -> EmgRecording:
+def read_emg_csv(
+    path: str | Path, close: str = "close", opening: str = "open", time: str = "t_s"
+) -> EmgRecording:
     """EMG from a CSV file with a header: a time column in s and one column in V (or fraction) for each channel.
 
     Other columns are ignored. Raises HannesError that names the file, the column and the line of what is wrong.
@@ -297,14 +320,18 @@ def read_emg_csv(path: str | Path, close: str = "close", opening: str = "open", 
             reader = csv.DictReader(file)
             missing = [name for name in names if name not in (reader.fieldnames or ())]
             if missing:
-                raise HannesError(f"{path}: there is no column '{missing[0]}'; the header is "
-                                  f"{', '.join(reader.fieldnames or ()) or 'empty'}, needed are {', '.join(names)}.")
+                raise HannesError(
+                    f"{path}: there is no column '{missing[0]}'; the header is "
+                    f"{', '.join(reader.fieldnames or ()) or 'empty'}, needed are {', '.join(names)}."
+                )
             for row in reader:
                 for name, column in zip(names, columns, strict=True):
                     column.append(_number(row[name], path, reader.line_num, name))
                 if len(columns[0]) > 1 and columns[0][-1] <= columns[0][-2]:
-                    raise HannesError(f"{path}, line {reader.line_num}: the time {columns[0][-1]} s is not after the "
-                                      f"one before, {columns[0][-2]} s.")
+                    raise HannesError(
+                        f"{path}, line {reader.line_num}: the time {columns[0][-1]} s is not after the "
+                        f"one before, {columns[0][-2]} s."
+                    )
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise HannesError(f"Cannot read the EMG file '{path}': {error}.") from error
     count = len(columns[0])
@@ -314,8 +341,10 @@ def read_emg_csv(path: str | Path, close: str = "close", opening: str = "open", 
     rate = (count - 1) / (t[-1] - t[0])
     gap = int(np.argmax(np.diff(t)))
     if np.diff(t)[gap] > 1.5 / rate:
-        raise HannesError(f"{path}: samples are missing after t = {t[gap]} s (a gap of {np.diff(t)[gap]:.4f} s at "
-                          f"{rate:.1f} Hz); the EMG must be sampled evenly.")
+        raise HannesError(
+            f"{path}: samples are missing after t = {t[gap]} s (a gap of {np.diff(t)[gap]:.4f} s at "
+            f"{rate:.1f} Hz); the EMG must be sampled evenly."
+        )
     # Times printed with few digits give 300.0016 Hz for 300 Hz.
     rate = float(round(rate)) if abs(rate - round(rate)) < 1e-3 * rate else float(rate)
     return EmgRecording(rate, np.array(columns[1]), np.array(columns[2]))

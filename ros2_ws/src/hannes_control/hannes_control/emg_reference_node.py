@@ -29,24 +29,48 @@ class EmgReferenceParameters:
     """ROS parameters of emg_reference; see EmgParameters for their meaning."""
 
     clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
-    subscribers: int = parameter(1, "subscribers that reference_position must have before the first answer in lockstep",
-                                 lower=1, upper=100)
+    subscribers: int = parameter(
+        1,
+        "subscribers that reference_position must have before the first answer in lockstep",
+        lower=1,
+        upper=100,
+    )
     rate: int = parameter(int(_DEFAULT.rate), "rate of both channels", lower=100, upper=2000, unit="Hz")
-    full_scale: float = parameter(_DEFAULT.full_scale, "envelope of a full contraction; thresholds are fractions of it",
-                                  lower=1e-9, upper=1e6, unit="V")
-    envelope_cutoff: float = parameter(_DEFAULT.envelope_cutoff, "low-pass of the rectified signal", lower=0.1,
-                                       upper=45.0, unit="Hz")
+    full_scale: float = parameter(
+        _DEFAULT.full_scale,
+        "envelope of a full contraction; thresholds are fractions of it",
+        lower=1e-9,
+        upper=1e6,
+        unit="V",
+    )
+    envelope_cutoff: float = parameter(
+        _DEFAULT.envelope_cutoff, "low-pass of the rectified signal", lower=0.1, upper=45.0, unit="Hz"
+    )
     dead_band: float = parameter(_DEFAULT.dead_band, "envelope of zero speed", lower=0.0, upper=1.0)
-    close_threshold: float = parameter(_DEFAULT.close_threshold, "flexor envelope that closes", lower=0.0, upper=10.0)
-    open_threshold: float = parameter(_DEFAULT.open_threshold, "extensor envelope that opens", lower=0.0, upper=10.0)
-    speed: float = parameter(_DEFAULT.speed, "speed of a full contraction", lower=1e-3, upper=1e3, unit="rad/s")
-    max_speed: float = parameter(_DEFAULT.max_speed, "limit of the speed", lower=1e-3, upper=1e3, unit="rad/s")
-    max_position: float = parameter(_DEFAULT.max_position, "largest reference", lower=1e-3, upper=100.0, unit="rad")
-    cocontraction_threshold: float = parameter(_DEFAULT.cocontraction_threshold,
-                                               "both envelopes above it: a switch event, no movement", lower=0.0,
-                                               upper=10.0)
-    cocontraction_time: float = parameter(_DEFAULT.cocontraction_time, "how long both must stay above it", lower=0.0,
-                                          upper=10.0, unit="s")
+    close_threshold: float = parameter(
+        _DEFAULT.close_threshold, "flexor envelope that closes", lower=0.0, upper=10.0
+    )
+    open_threshold: float = parameter(
+        _DEFAULT.open_threshold, "extensor envelope that opens", lower=0.0, upper=10.0
+    )
+    speed: float = parameter(
+        _DEFAULT.speed, "speed of a full contraction", lower=1e-3, upper=1e3, unit="rad/s"
+    )
+    max_speed: float = parameter(
+        _DEFAULT.max_speed, "limit of the speed", lower=1e-3, upper=1e3, unit="rad/s"
+    )
+    max_position: float = parameter(
+        _DEFAULT.max_position, "largest reference", lower=1e-3, upper=100.0, unit="rad"
+    )
+    cocontraction_threshold: float = parameter(
+        _DEFAULT.cocontraction_threshold,
+        "both envelopes above it: a switch event, no movement",
+        lower=0.0,
+        upper=10.0,
+    )
+    cocontraction_time: float = parameter(
+        _DEFAULT.cocontraction_time, "how long both must stay above it", lower=0.0, upper=10.0, unit="s"
+    )
 
     def emg(self) -> EmgParameters:
         """The same values as the core takes them."""
@@ -72,8 +96,14 @@ class EmgReferenceNode(HannesNode, Node):
         self._health = Health("rejected_samples", "rejected_states")
         self._reference = topics.publisher(self, "reference_position")
         self._lockstep = p.clock == "lockstep"
-        self._peers = Peers({f"{p.subscribers} subscriber(s) of reference_position": (
-            self._reference.get_subscription_count, p.subscribers)})
+        self._peers = Peers(
+            {
+                f"{p.subscribers} subscriber(s) of reference_position": (
+                    self._reference.get_subscription_count,
+                    p.subscribers,
+                )
+            }
+        )
         topics.subscription(self, "emg_flexor", lambda data: self._on_emg(0, data))
         topics.subscription(self, "emg_extensor", lambda data: self._on_emg(1, data))
         if self._lockstep:
@@ -142,8 +172,11 @@ class EmgReferenceNode(HannesNode, Node):
             self._answer()
 
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
-        values: dict[str, object] = {"reference_rad": f"{self._emg.reference:.6g}", "switch_events": self._switches,
-                  "samples": self._taken}
+        values: dict[str, object] = {
+            "reference_rad": f"{self._emg.reference:.6g}",
+            "switch_events": self._switches,
+            "samples": self._taken,
+        }
         if self._lockstep and (missing := self._peers.missing()):
             return WARN, f"waiting for {', '.join(missing)}", values
         if self._health.last_input is None:

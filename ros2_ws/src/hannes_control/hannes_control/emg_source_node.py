@@ -26,28 +26,40 @@ class EmgSourceParameters:
     """ROS parameters of emg_source."""
 
     file: str = parameter("", "CSV file with columns t_s, close, open; empty for synthetic EMG")
-    rate: int = parameter(300, "rate of the samples; a file of another rate is resampled", lower=100, upper=2000,
-                          unit="Hz")
+    rate: int = parameter(
+        300, "rate of the samples; a file of another rate is resampled", lower=100, upper=2000, unit="Hz"
+    )
     clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
-    subscribers: int = parameter(1, "subscribers that each channel must have before the first sample in lockstep",
-                                 lower=1, upper=100)
+    subscribers: int = parameter(
+        1, "subscribers that each channel must have before the first sample in lockstep", lower=1, upper=100
+    )
     seed: int = parameter(0, "seed of the synthetic EMG", lower=0, upper=2**31)
     closures: int = parameter(1, "closures of the synthetic EMG", lower=1, upper=100000)
     close_time: float = parameter(1.6, "contraction of the flexor", lower=0.1, upper=100.0, unit="s")
     hold_time: float = parameter(1.0, "rest between closing and opening", lower=0.0, upper=100.0, unit="s")
     open_time: float = parameter(1.6, "contraction of the extensor", lower=0.1, upper=100.0, unit="s")
     rest_time: float = parameter(0.8, "rest after opening", lower=0.0, upper=100.0, unit="s")
-    cocontraction_time: float = parameter(0.0, "contraction of both after each closure", lower=0.0, upper=100.0,
-                                          unit="s")
-    amplitude: float = parameter(1.0, "mean rectified value of a full contraction", lower=1e-6, upper=100.0, unit="V")
+    cocontraction_time: float = parameter(
+        0.0, "contraction of both after each closure", lower=0.0, upper=100.0, unit="s"
+    )
+    amplitude: float = parameter(
+        1.0, "mean rectified value of a full contraction", lower=1e-6, upper=100.0, unit="V"
+    )
 
     def recording(self) -> EmgRecording:
         """The samples to play, at `rate`."""
         if self.file:
             return read_emg_csv(self.file).resampled(self.rate)
-        protocol = SyntheticEmg(closures=self.closures, close=self.close_time, hold=self.hold_time, open=self.open_time,
-                                rest=self.rest_time, cocontraction=self.cocontraction_time, amplitude=self.amplitude,
-                                noise=0.02 * self.amplitude)
+        protocol = SyntheticEmg(
+            closures=self.closures,
+            close=self.close_time,
+            hold=self.hold_time,
+            open=self.open_time,
+            rest=self.rest_time,
+            cocontraction=self.cocontraction_time,
+            amplitude=self.amplitude,
+            noise=0.02 * self.amplitude,
+        )
         return synthesise(protocol, self.seed, self.rate)
 
 
@@ -61,8 +73,10 @@ class EmgSource(HannesNode, Node):
         super().__init__(self.node_name, namespace=DEFAULT_NAMESPACE, cli_args=cli_args)
         self._p = p = declare(self, EmgSourceParameters)
         recording = p.recording()
-        self._samples = [tuple(map(convert.float64_bytes, pair))
-                         for pair in zip(recording.flexor.tolist(), recording.extensor.tolist(), strict=True)]
+        self._samples = [
+            tuple(map(convert.float64_bytes, pair))
+            for pair in zip(recording.flexor.tolist(), recording.extensor.tolist(), strict=True)
+        ]
         self._rest = (convert.float64_bytes(0.0), convert.float64_bytes(0.0))
         self._sent = 0
         self._until = 0
@@ -71,9 +85,18 @@ class EmgSource(HannesNode, Node):
         self._flexor = topics.publisher(self, "emg_flexor")
         self._extensor = topics.publisher(self, "emg_extensor")
         self._lockstep = p.clock == "lockstep"
-        self._peers = Peers({
-            f"{p.subscribers} subscriber(s) of emg/flexor": (self._flexor.get_subscription_count, p.subscribers),
-            f"{p.subscribers} subscriber(s) of emg/extensor": (self._extensor.get_subscription_count, p.subscribers)})
+        self._peers = Peers(
+            {
+                f"{p.subscribers} subscriber(s) of emg/flexor": (
+                    self._flexor.get_subscription_count,
+                    p.subscribers,
+                ),
+                f"{p.subscribers} subscriber(s) of emg/extensor": (
+                    self._extensor.get_subscription_count,
+                    p.subscribers,
+                ),
+            }
+        )
         self._loop = RealtimeLoop(1.0 / p.rate, self._step)
         self._diagnostics = Diagnostics(self, self._health, self._status)
         self.wall_timer(_CHECK_S, self._check)

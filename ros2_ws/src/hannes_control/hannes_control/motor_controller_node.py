@@ -32,27 +32,49 @@ class MotorControllerParameters:
     model: str = parameter("nominal", "model whose gains and limits are used: name or path of a model file")
     clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
     period: float = parameter(1e-3, "control period", lower=1e-4, upper=1e-1, unit="s")
-    autostart: bool = parameter(True, "configure and activate at start; otherwise wait for the lifecycle services")
-    reference: str = parameter("topic", "topic, or a profile of its own from the activation on",
-                               choices=("topic", *PROFILES))
+    autostart: bool = parameter(
+        True, "configure and activate at start; otherwise wait for the lifecycle services"
+    )
+    reference: str = parameter(
+        "topic", "topic, or a profile of its own from the activation on", choices=("topic", *PROFILES)
+    )
     reference_closures: int = parameter(1, "closures of the profile", lower=1, upper=100000)
-    reference_amplitude: float = parameter(FULL_CLOSURE, "amplitude of the profile", lower=1e-3, upper=100.0,
-                                           unit="rad")
-    reference_period: float = parameter(0.0, "period of the profile, 0 for its own", lower=0.0, upper=1e3, unit="s")
-    subscribers: int = parameter(1, "subscribers that motor/voltage must have before the first answer in lockstep",
-                                 lower=1, upper=100)
-    state_timeout_ms: float = parameter(50.0, "age of motor/state or motor/current from which the command is 0 V",
-                                        lower=1.0, upper=1e4, unit="ms")
-    pause_limit_ms: float = parameter(100.0, "a pause of the control loop longer than this deactivates the node",
-                                      lower=1.0, upper=1e4, unit="ms")
+    reference_amplitude: float = parameter(
+        FULL_CLOSURE, "amplitude of the profile", lower=1e-3, upper=100.0, unit="rad"
+    )
+    reference_period: float = parameter(
+        0.0, "period of the profile, 0 for its own", lower=0.0, upper=1e3, unit="s"
+    )
+    subscribers: int = parameter(
+        1, "subscribers that motor/voltage must have before the first answer in lockstep", lower=1, upper=100
+    )
+    state_timeout_ms: float = parameter(
+        50.0,
+        "age of motor/state or motor/current from which the command is 0 V",
+        lower=1.0,
+        upper=1e4,
+        unit="ms",
+    )
+    pause_limit_ms: float = parameter(
+        100.0,
+        "a pause of the control loop longer than this deactivates the node",
+        lower=1.0,
+        upper=1e4,
+        unit="ms",
+    )
 
     def profile(self) -> Profile | None:
         """The profile (n,) in rad, None for the topic."""
         if self.reference == "topic":
             return None
         options = {"period": self.reference_period} if self.reference_period > 0.0 else {}
-        return make_profile(self.reference, closures=self.reference_closures, amplitude=self.reference_amplitude,
-                            dt=self.period, **options)
+        return make_profile(
+            self.reference,
+            closures=self.reference_closures,
+            amplitude=self.reference_amplitude,
+            dt=self.period,
+            **options,
+        )
 
 
 class MotorController(HannesNode, LifecycleNode):
@@ -66,8 +88,10 @@ class MotorController(HannesNode, LifecycleNode):
         self._p = p = declare(self, MotorControllerParameters)
         model = Model.load(p.model)
         if model.controller != "double_pid":
-            raise HannesError(f"Model '{model.name}' asks for the controller '{model.controller}'; this node runs "
-                              "double_pid only.")
+            raise HannesError(
+                f"Model '{model.name}' asks for the controller '{model.controller}'; this node runs "
+                "double_pid only."
+            )
         self._pid = DoublePID.of_model(model.parameters, p.period)
         self._limit = self._pid.settings.voltage_limit
         self._profile = p.profile()
@@ -87,15 +111,26 @@ class MotorController(HannesNode, LifecycleNode):
         self._missed = 0
 
         self._voltage = topics.publisher(self, "motor_voltage")
-        topics.subscription(self, "encoder_position", self._on_tick_state if self._lockstep else self._on_state)
-        topics.subscription(self, "motor_current", self._on_tick_current if self._lockstep else self._on_current)
+        topics.subscription(
+            self, "encoder_position", self._on_tick_state if self._lockstep else self._on_state
+        )
+        topics.subscription(
+            self, "motor_current", self._on_tick_current if self._lockstep else self._on_current
+        )
         # who records wants the reference on its topic, wherever it comes from
         self._own_reference = None if self._profile is None else topics.publisher(self, "reference_position")
         if self._profile is None:
-            topics.subscription(self, "reference_position",
-                                self._on_tick_reference if self._lockstep else self._on_reference)
-        self._peers = Peers({f"{p.subscribers} subscriber(s) of motor/voltage": (self._voltage.get_subscription_count,
-                                                                                  p.subscribers)})
+            topics.subscription(
+                self, "reference_position", self._on_tick_reference if self._lockstep else self._on_reference
+            )
+        self._peers = Peers(
+            {
+                f"{p.subscribers} subscriber(s) of motor/voltage": (
+                    self._voltage.get_subscription_count,
+                    p.subscribers,
+                )
+            }
+        )
         self._diagnostics = Diagnostics(self, self._health, self._status)
         self.wall_timer(_CHECK_S, self._check)
         if p.autostart:
@@ -211,7 +246,9 @@ class MotorController(HannesNode, LifecycleNode):
         else:
             self._stale = False
             reference = self._reference if self._profile is None else self._profile_at(self._start)
-            voltage = 0.0 if reference is None else self._command(reference, self._state.position[0], self._current)
+            voltage = (
+                0.0 if reference is None else self._command(reference, self._state.position[0], self._current)
+            )
         self._voltage.publish(convert.float64_bytes(voltage))
         self._health.cycles += 1
 
@@ -249,26 +286,38 @@ class MotorController(HannesNode, LifecycleNode):
                 continue
             step_ns = sample.stamp_ns - self._answered
             if self._answered >= 0 and step_ns != self._period_ns:
-                self.fail(f"motor/state comes every {step_ns * 1e-9:g} s, but the control period is "
-                          f"{self._p.period:g} s; give hand_sim and motor_controller the same period.")
+                self.fail(
+                    f"motor/state comes every {step_ns * 1e-9:g} s, but the control period is "
+                    f"{self._p.period:g} s; give hand_sim and motor_controller the same period."
+                )
                 return
-            reference = tick[2] if self._profile is None else self._profile_at(sample.stamp_ns // self._period_ns)
+            reference = (
+                tick[2] if self._profile is None else self._profile_at(sample.stamp_ns // self._period_ns)
+            )
             self._answered = sample.stamp_ns
             self._join.synchronise()
             self._health.cycles += 1
-            self._voltage.publish(convert.float64_bytes(self._command(reference, sample.position[0], current)))
+            self._voltage.publish(
+                convert.float64_bytes(self._command(reference, sample.position[0], current))
+            )
 
     # -- health ------------------------------------------------------------------------------------------------------
     def _check(self) -> None:
-        if self._lockstep and not self._peers.missing() and not self._join.synchronised \
-                and monotonic() - self._state_at >= SETTLE_S:
+        if (
+            self._lockstep
+            and not self._peers.missing()
+            and not self._join.synchronised
+            and monotonic() - self._state_at >= SETTLE_S
+        ):
             self._answer()
         if self._loop is not None and self._loop.error is not None:
             self.fail(f"The control loop stopped: {self._loop.error!r}")
         if self._tripped and self._active:
             self._health.count("trips")
-            self.get_logger().error(f"the control loop paused for more than {self._p.pause_limit_ms:g} ms: motor off; "
-                                    "activate the node again")
+            self.get_logger().error(
+                f"the control loop paused for more than {self._p.pause_limit_ms:g} ms: motor off; "
+                "activate the node again"
+            )
             self.trigger_deactivate()
             self._diagnostics.publish()
 
@@ -276,7 +325,11 @@ class MotorController(HannesNode, LifecycleNode):
         self._health.last_input = self._state_at or None
         age = f"{monotonic() - self._reference_at:.3f}" if self._reference_at else ""
         self._health.missed = self._missed + (self._loop.missed if self._loop else 0)
-        values: dict[str, object] = {"active": self._active, "battery_saver": self._pid.saving, "reference_age_s": age}
+        values: dict[str, object] = {
+            "active": self._active,
+            "battery_saver": self._pid.saving,
+            "reference_age_s": age,
+        }
         if not self._active:
             return WARN, "not active: motor off" + ("; activate again" if self._tripped else ""), values
         if self._lockstep and (absent := self._peers.missing()):
@@ -287,9 +340,15 @@ class MotorController(HannesNode, LifecycleNode):
             return OK, f"waiting for {', '.join(missing)}" if missing else "running", values
         if self._stale:
             return ERROR, "motor/state or motor/current is too old: 0 V", values
-        absent = [name for name, value in zip(names, (self._state, self._current,
-                                                      self._reference if self._profile is None else 0.0), strict=True)
-                  if value is None]
+        absent = [
+            name
+            for name, value in zip(
+                names,
+                (self._state, self._current, self._reference if self._profile is None else 0.0),
+                strict=True,
+            )
+            if value is None
+        ]
         return (WARN, f"waiting for {', '.join(absent)}", values) if absent else (OK, "running", values)
 
 

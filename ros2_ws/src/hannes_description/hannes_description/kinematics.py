@@ -78,8 +78,10 @@ def _moments(flexion: float) -> tuple[float, float, float]:
 def check_thumb_stop(thumb_stop_deg: float) -> int:
     """The stop in degrees if it is one of the thumb's three stops, otherwise an error that lists them."""
     if thumb_stop_deg not in THUMB_STOPS_DEG:
-        raise HannesError(f"The thumb's rotation stop is {thumb_stop_deg} deg; valid are "
-                          f"{', '.join(str(s) for s in THUMB_STOPS_DEG)}.")
+        raise HannesError(
+            f"The thumb's rotation stop is {thumb_stop_deg} deg; valid are "
+            f"{', '.join(str(s) for s in THUMB_STOPS_DEG)}."
+        )
     return int(thumb_stop_deg)
 
 
@@ -101,25 +103,68 @@ def links(parameters: Parameters, thumb_stop_deg: float = 0) -> tuple[Link, ...]
         proximal, distal = v(f"geometry.{finger}_proximal"), v(f"geometry.{finger}_distal")
         base = v("inertia.base_inertia")
         abd, mcp, pip = (f"{finger}_{joint}" for joint in ("abd", "mcp", "pip"))
-        out.append(Link(f"{finger}_base", ROOT, place, (0.0, 0.0, 0.0),
-                        Joint(abd, (-1.0, 0.0, 0.0), JOINT_LIMITS[abd]), v("inertia.base_mass"), 0.0,
-                        (base, base, base)))
-        out.append(Link(f"{finger}_phalanx", f"{finger}_base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0),
-                        Joint(mcp, flex, JOINT_LIMITS[mcp]), v(f"inertia.{finger}_m1"), v(f"inertia.{finger}_lm1"),
-                        _moments(v(f"inertia.{finger}_j1")), proximal, radius))
-        out.append(Link(f"{finger}_middle", f"{finger}_phalanx", (0.0, 0.0, proximal), (0.0, 0.0, 0.0),
-                        Joint(pip, flex, JOINT_LIMITS[pip]), v(f"inertia.{finger}_m2"), v(f"inertia.{finger}_lm2"),
-                        _moments(v(f"inertia.{finger}_j2")), distal, 0.92 * radius, v("geometry.tip_overhang")))
+        out.append(
+            Link(
+                f"{finger}_base",
+                ROOT,
+                place,
+                (0.0, 0.0, 0.0),
+                Joint(abd, (-1.0, 0.0, 0.0), JOINT_LIMITS[abd]),
+                v("inertia.base_mass"),
+                0.0,
+                (base, base, base),
+            )
+        )
+        out.append(
+            Link(
+                f"{finger}_phalanx",
+                f"{finger}_base",
+                (0.0, 0.0, 0.0),
+                (0.0, 0.0, 0.0),
+                Joint(mcp, flex, JOINT_LIMITS[mcp]),
+                v(f"inertia.{finger}_m1"),
+                v(f"inertia.{finger}_lm1"),
+                _moments(v(f"inertia.{finger}_j1")),
+                proximal,
+                radius,
+            )
+        )
+        out.append(
+            Link(
+                f"{finger}_middle",
+                f"{finger}_phalanx",
+                (0.0, 0.0, proximal),
+                (0.0, 0.0, 0.0),
+                Joint(pip, flex, JOINT_LIMITS[pip]),
+                v(f"inertia.{finger}_m2"),
+                v(f"inertia.{finger}_lm2"),
+                _moments(v(f"inertia.{finger}_j2")),
+                distal,
+                0.92 * radius,
+                v("geometry.tip_overhang"),
+            )
+        )
     place = (v("geometry.thumb_x"), v("geometry.thumb_y"), v("geometry.thumb_z"))
     # The rotation turns the whole thumb about the palm's long axis.  A stop of -60 deg lays it beside the index.
     yaw = v("geometry.thumb_yaw") - math.radians(stop)
     rpy = (v("geometry.thumb_roll"), v("geometry.thumb_pitch"), yaw)
     base = v("inertia.base_inertia")
     out.append(Link("thumb_base", ROOT, place, rpy, None, v("inertia.base_mass"), 0.0, (base, base, base)))
-    out.append(Link("thumb", "thumb_base", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0),
-                    Joint("thumb_abd", flex, JOINT_LIMITS["thumb_abd"]), v("inertia.thumb_m1"), v("inertia.thumb_lm1"),
-                    _moments(v("inertia.thumb_j1")), v("geometry.thumb_length"), v("geometry.thumb_radius"),
-                    v("geometry.tip_overhang")))
+    out.append(
+        Link(
+            "thumb",
+            "thumb_base",
+            (0.0, 0.0, 0.0),
+            (0.0, 0.0, 0.0),
+            Joint("thumb_abd", flex, JOINT_LIMITS["thumb_abd"]),
+            v("inertia.thumb_m1"),
+            v("inertia.thumb_lm1"),
+            _moments(v("inertia.thumb_j1")),
+            v("geometry.thumb_length"),
+            v("geometry.thumb_radius"),
+            v("geometry.tip_overhang"),
+        )
+    )
     return tuple(out)
 
 
@@ -128,9 +173,13 @@ def rotation(rpy: tuple[float, float, float]) -> Array:
     cr, sr = math.cos(rpy[0]), math.sin(rpy[0])
     cp, sp = math.cos(rpy[1]), math.sin(rpy[1])
     cy, sy = math.cos(rpy[2]), math.sin(rpy[2])
-    return np.array([[cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-                     [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-                     [-sp, cp * sr, cp * cr]])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
 
 
 def quaternion(rpy: tuple[float, float, float]) -> tuple[float, float, float, float]:
@@ -138,8 +187,12 @@ def quaternion(rpy: tuple[float, float, float]) -> tuple[float, float, float, fl
     cr, sr = math.cos(rpy[0] / 2), math.sin(rpy[0] / 2)
     cp, sp = math.cos(rpy[1] / 2), math.sin(rpy[1] / 2)
     cy, sy = math.cos(rpy[2] / 2), math.sin(rpy[2] / 2)
-    return (cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
 
 
 def axis_rotation(axis: tuple[float, float, float], angle: float) -> Array:
@@ -153,7 +206,9 @@ def axis_rotation(axis: tuple[float, float, float], angle: float) -> Array:
 def forward_kinematics(tree: tuple[Link, ...], positions: Array) -> dict[str, tuple[Array, Array]]:
     """Position (3,) in m and rotation (3, 3) of every link in the palm frame, for joint positions (13,) in rad."""
     if np.shape(positions) != (len(JOINT_NAMES),):
-        raise HannesError(f"Joint positions must have shape ({len(JOINT_NAMES)},), not {np.shape(positions)}.")
+        raise HannesError(
+            f"Joint positions must have shape ({len(JOINT_NAMES)},), not {np.shape(positions)}."
+        )
     angle = dict(zip(JOINT_NAMES, positions, strict=True))
     poses: dict[str, tuple[Array, Array]] = {ROOT: (np.zeros(3), np.eye(3))}
     for link in tree:

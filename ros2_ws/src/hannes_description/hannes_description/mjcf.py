@@ -98,10 +98,14 @@ class Variant:
 
     def __post_init__(self) -> None:
         if self.return_mechanism not in RETURN_MECHANISMS:
-            raise HannesError(f"Return mechanism {self.return_mechanism!r} is unknown; valid are "
-                              f"{', '.join(RETURN_MECHANISMS)}.")
+            raise HannesError(
+                f"Return mechanism {self.return_mechanism!r} is unknown; valid are "
+                f"{', '.join(RETURN_MECHANISMS)}."
+            )
         if self.transmission not in TRANSMISSIONS:
-            raise HannesError(f"Transmission {self.transmission!r} is unknown; valid are {', '.join(TRANSMISSIONS)}.")
+            raise HannesError(
+                f"Transmission {self.transmission!r} is unknown; valid are {', '.join(TRANSMISSIONS)}."
+            )
         check_thumb_stop(self.thumb_stop_deg)
 
     @classmethod
@@ -109,8 +113,10 @@ class Variant:
         """From the options of a model file; unknown names are refused."""
         unknown = sorted(set(options) - set(cls.__dataclass_fields__))
         if unknown:
-            raise HannesError(f"Variant: unknown options {', '.join(unknown)}; valid are "
-                              f"{', '.join(cls.__dataclass_fields__)}.")
+            raise HannesError(
+                f"Variant: unknown options {', '.join(unknown)}; valid are "
+                f"{', '.join(cls.__dataclass_fields__)}."
+            )
         return cls(**dict(options))
 
 
@@ -149,7 +155,10 @@ def return_moments(parameters: Parameters) -> dict[str, tuple[float, float]]:
         joints = joints_of(digit)
         arms = {joint: value(parameters, f"springs.{joint}_arm") for joint in joints}
         travel = sum(arms[joint] * JOINT_LIMITS[joint].upper for joint in joints)
-        preload, rate = value(parameters, f"springs.{digit}_preload"), value(parameters, f"springs.{digit}_rate")
+        preload, rate = (
+            value(parameters, f"springs.{digit}_preload"),
+            value(parameters, f"springs.{digit}_rate"),
+        )
         for joint in joints:
             out[joint] = (preload * arms[joint], rate * travel * arms[joint] / JOINT_LIMITS[joint].upper)
     return out
@@ -192,8 +201,11 @@ def _flat(impedance: float) -> list[float]:
     return [impedance, impedance, 0.001, 0.5, 2.0]
 
 
-def build_spec(parameters: Parameters, variant: Variant | Mapping[str, Any] | None = None,
-               grasp: GraspShape | None = None) -> mujoco.MjSpec:
+def build_spec(
+    parameters: Parameters,
+    variant: Variant | Mapping[str, Any] | None = None,
+    grasp: GraspShape | None = None,
+) -> mujoco.MjSpec:
     """The model's specification, with every stiffness mapped; `.compile()` gives the mjModel.
 
     parameters  a ParameterSet or mapping of dotted names to Parameter: groups geometry, inertia, gravity, pulleys,
@@ -245,9 +257,13 @@ def build_spec(parameters: Parameters, variant: Variant | Mapping[str, Any] | No
 
 
 def _add_materials(spec: mujoco.MjSpec) -> None:
-    for name, rgba, shininess in (("shell", (0.80, 0.81, 0.83, 1), 0.5), ("palm", (0.24, 0.26, 0.30, 1), 0.3),
-                                  ("joint", (0.14, 0.15, 0.17, 1), 0.6), ("pad", (0.90, 0.54, 0.30, 1), 0.1),
-                                  ("object", (0.24, 0.55, 0.72, 0.80), 0.4)):
+    for name, rgba, shininess in (
+        ("shell", (0.80, 0.81, 0.83, 1), 0.5),
+        ("palm", (0.24, 0.26, 0.30, 1), 0.3),
+        ("joint", (0.14, 0.15, 0.17, 1), 0.6),
+        ("pad", (0.90, 0.54, 0.30, 1), 0.1),
+        ("object", (0.24, 0.55, 0.72, 0.80), 0.4),
+    ):
         spec.add_material(name=name, rgba=list(rgba), shininess=shininess, specular=shininess)
 
 
@@ -261,17 +277,35 @@ def _add_palm(palm: Any, parameters: Parameters) -> None:
     for finger in FINGERS:
         x, y, z = (value(parameters, f"geometry.{finger}_{axis}") for axis in "xyz")
         radius = value(parameters, f"geometry.{finger}_radius")
-        _visual(palm, capsule, "palm", fromto=[x, y, z - 0.003, 0.6 * x - 0.001, 0.62 * y, 0.020],
-                size=[1.22 * radius, 0, 0])
+        _visual(
+            palm,
+            capsule,
+            "palm",
+            fromto=[x, y, z - 0.003, 0.6 * x - 0.001, 0.62 * y, 0.020],
+            size=[1.22 * radius, 0, 0],
+        )
         _visual(palm, mujoco.mjtGeom.mjGEOM_SPHERE, "joint", pos=[x, y, z], size=[1.12 * radius, 0, 0])
     _visual(palm, ellipsoid, "palm", pos=[-0.002, 0.0, 0.058], size=[0.0145, 0.040, 0.048])
     _visual(palm, ellipsoid, "palm", pos=[0.002, -0.020, 0.040], size=[0.0165, 0.020, 0.036])
     tx, ty, tz = (value(parameters, f"geometry.thumb_{axis}") for axis in "xyz")
-    _visual(palm, capsule, "palm", fromto=[0.004, 0.012, 0.016, 0.85 * tx, 0.92 * ty, 0.95 * tz],
-            size=[0.0135, 0, 0])
+    _visual(
+        palm,
+        capsule,
+        "palm",
+        fromto=[0.004, 0.012, 0.016, 0.85 * tx, 0.92 * ty, 0.95 * tz],
+        size=[0.0135, 0, 0],
+    )
     _visual(palm, mujoco.mjtGeom.mjGEOM_SPHERE, "joint", pos=[tx, ty, tz], size=[0.0125, 0, 0])
-    _visual(palm, mujoco.mjtGeom.mjGEOM_CYLINDER, "joint", fromto=[0, 0, -0.012, 0, 0, 0.004], size=[0.0225, 0, 0])
-    _visual(palm, mujoco.mjtGeom.mjGEOM_CYLINDER, "shell", fromto=[0, 0, -0.050, 0, 0, -0.012], size=[0.0245, 0, 0])
+    _visual(
+        palm, mujoco.mjtGeom.mjGEOM_CYLINDER, "joint", fromto=[0, 0, -0.012, 0, 0, 0.004], size=[0.0225, 0, 0]
+    )
+    _visual(
+        palm,
+        mujoco.mjtGeom.mjGEOM_CYLINDER,
+        "shell",
+        fromto=[0, 0, -0.050, 0, 0, -0.012],
+        size=[0.0245, 0, 0],
+    )
 
 
 def _add_link(parent: Any, link: Link, parameters: Parameters) -> Any:
@@ -279,8 +313,13 @@ def _add_link(parent: Any, link: Link, parameters: Parameters) -> Any:
     body.explicitinertial = True
     body.mass, body.ipos, body.inertia = link.mass, [0.0, 0.0, link.com], list(link.inertia)
     if link.joint is not None:
-        joint = body.add_joint(name=link.joint.name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=list(link.joint.axis),
-                               limited=True, range=[link.joint.limit.lower, link.joint.limit.upper])
+        joint = body.add_joint(
+            name=link.joint.name,
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=list(link.joint.axis),
+            limited=True,
+            range=[link.joint.limit.lower, link.joint.limit.upper],
+        )
         joint.solref_friction, joint.solimp_friction = list(FRICTION_SOLREF), list(FRICTION_SOLIMP)
         joint.solimp_limit = _flat(STOP_IMPEDANCE)
         if link.length == 0.0:
@@ -299,13 +338,32 @@ def _add_shape(body: Any, link: Link) -> None:
     # The capsule `<link>` is what touches objects; its round end lies at the finger's end.
     end = link.length + link.overhang - (link.radius if link.overhang else 0.0)
     material = "shell"
-    body.add_geom(name=link.name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, 0, 0, end],
-                  size=[link.radius, 0, 0], mass=0.0, contype=0, conaffinity=0, material=material, group=1)
-    _visual(body, mujoco.mjtGeom.mjGEOM_CYLINDER, "joint", size=[0.80 * link.radius, 0, 0],
-            fromto=[0, -1.06 * link.radius, 0, 0, 1.06 * link.radius, 0])
+    body.add_geom(
+        name=link.name,
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=[0, 0, 0, 0, 0, end],
+        size=[link.radius, 0, 0],
+        mass=0.0,
+        contype=0,
+        conaffinity=0,
+        material=material,
+        group=1,
+    )
+    _visual(
+        body,
+        mujoco.mjtGeom.mjGEOM_CYLINDER,
+        "joint",
+        size=[0.80 * link.radius, 0, 0],
+        fromto=[0, -1.06 * link.radius, 0, 0, 1.06 * link.radius, 0],
+    )
     if link.overhang:
-        _visual(body, mujoco.mjtGeom.mjGEOM_ELLIPSOID, "pad", pos=[0.30 * link.radius, 0, link.length - 0.004],
-                size=[0.76 * link.radius, 0.74 * link.radius, 1.25 * link.radius])
+        _visual(
+            body,
+            mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+            "pad",
+            pos=[0.30 * link.radius, 0, link.length - 0.004],
+            size=[0.76 * link.radius, 0.74 * link.radius, 1.25 * link.radius],
+        )
 
 
 def _scalar(element: Any, name: str, number: float) -> None:
@@ -328,7 +386,10 @@ def _add_return(spec: mujoco.MjSpec, parameters: Parameters, variant: Variant) -
     for digit in DIGITS:
         # The coefficients are negative, so that a positive spring length is the preload and the wire pulls the
         # digit open: force = rate (springlength - length), springlength = preload / rate.
-        preload, rate = value(parameters, f"springs.{digit}_preload"), value(parameters, f"springs.{digit}_rate")
+        preload, rate = (
+            value(parameters, f"springs.{digit}_preload"),
+            value(parameters, f"springs.{digit}_rate"),
+        )
         if rate <= 0.0:
             raise HannesError(f"The return wire needs springs.{digit}_rate above 0, not {rate} N/m.")
         tendon = spec.add_tendon(name=f"return_{digit}", limited=False)
@@ -394,15 +455,24 @@ def _add_drive(spec: mujoco.MjSpec, parameters: Parameters) -> None:
     drive.wrap_joint(MOTOR, 1.0)
     for joint, arm in transmission_jacobian(parameters).items():
         drive.wrap_joint(joint, -arm)
-    spec.add_equality(name=DRIVE, type=mujoco.mjtEq.mjEQ_TENDON, objtype=mujoco.mjtObj.mjOBJ_TENDON, name1=DRIVE,
-                      solimp=_flat(WIRE_IMPEDANCE))
+    spec.add_equality(
+        name=DRIVE,
+        type=mujoco.mjtEq.mjEQ_TENDON,
+        objtype=mujoco.mjtObj.mjOBJ_TENDON,
+        name1=DRIVE,
+        solimp=_flat(WIRE_IMPEDANCE),
+    )
 
 
 def _add_object(spec: mujoco.MjSpec, grasp: GraspShape, tree: tuple[Link, ...]) -> None:
     """The object on a fixed body, one explicit contact pair with every phalanx, and a sensor of the normal forces."""
-    kinds = {"capsule": mujoco.mjtGeom.mjGEOM_CAPSULE, "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-             "box": mujoco.mjtGeom.mjGEOM_BOX, "prism": mujoco.mjtGeom.mjGEOM_MESH,
-             "pentagon": mujoco.mjtGeom.mjGEOM_MESH}
+    kinds = {
+        "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+        "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+        "box": mujoco.mjtGeom.mjGEOM_BOX,
+        "prism": mujoco.mjtGeom.mjGEOM_MESH,
+        "pentagon": mujoco.mjtGeom.mjGEOM_MESH,
+    }
     if grasp.shape not in kinds:
         raise HannesError(f"Object shape {grasp.shape!r} is unknown; valid are {', '.join(kinds)}.")
     place = [a + b for a, b in zip(GRASP_CENTRE, grasp.place, strict=True)]
@@ -417,33 +487,54 @@ def _add_object(spec: mujoco.MjSpec, grasp: GraspShape, tree: tuple[Link, ...]) 
     elif grasp.shape in PRISM_SIDES:
         spec.add_mesh(name="object", uservert=_prism(PRISM_SIDES[grasp.shape], half))
         shape = {"meshname": "object"}
-    body.add_geom(name="object", type=kinds[grasp.shape], contype=0, conaffinity=0, material="object", group=0, **shape)
+    body.add_geom(
+        name="object", type=kinds[grasp.shape], contype=0, conaffinity=0, material="object", group=0, **shape
+    )
     body.add_site(name="object", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1.0, 0.0, 0.0], group=5)
-    spec.add_sensor(name="grip_force", type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE,
-                    objname="object")
+    spec.add_sensor(
+        name="grip_force",
+        type=mujoco.mjtSensor.mjSENS_TOUCH,
+        objtype=mujoco.mjtObj.mjOBJ_SITE,
+        objname="object",
+    )
     for link in tree:
         if link.length > 0.0:
-            spec.add_pair(name=f"object_{link.name}", geomname1="object", geomname2=link.name,
-                          condim=3 if grasp.friction > 0.0 else 1,
-                          friction=[max(grasp.friction, 1e-5)] * 2 + [0.0, 0.0, 0.0])
+            spec.add_pair(
+                name=f"object_{link.name}",
+                geomname1="object",
+                geomname2=link.name,
+                condim=3 if grasp.friction > 0.0 else 1,
+                friction=[max(grasp.friction, 1e-5)] * 2 + [0.0, 0.0, 0.0],
+            )
 
 
 def _prism(sides: int, radius: float) -> list[float]:
     """Corners (flat x, y, z) of a regular prism along y, one edge towards the fingertips' side (distal)."""
     angles = 2.0 * math.pi * np.arange(sides) / sides
-    return [c for y in (-BAR_HALF_LENGTH, BAR_HALF_LENGTH) for a in angles
-            for c in (radius * math.sin(a), y, radius * math.cos(a))]
+    return [
+        c
+        for y in (-BAR_HALF_LENGTH, BAR_HALF_LENGTH)
+        for a in angles
+        for c in (radius * math.sin(a), y, radius * math.cos(a))
+    ]
 
 
-def _map_stiffness(spec: mujoco.MjSpec, parameters: Parameters, variant: Variant, grasp: GraspShape | None) -> None:
+def _map_stiffness(
+    spec: mujoco.MjSpec, parameters: Parameters, variant: Variant, grasp: GraspShape | None
+) -> None:
     """Give stops, wires and contacts their stiffness: compile once for the constraint weights, then set solref."""
+
     def v(name: str) -> float:
         return value(parameters, name)
 
     if variant.transmission == "wires":
         for name in (MASTER, *SLAVES):
-            spec.add_sensor(name=f"tension_{name}", type=mujoco.mjtSensor.mjSENS_TENDONLIMITFRC,
-                            objtype=mujoco.mjtObj.mjOBJ_TENDON, objname=name)
+            spec.add_sensor(
+                name=f"tension_{name}",
+                type=mujoco.mjtSensor.mjSENS_TENDONLIMITFRC,
+                objtype=mujoco.mjtObj.mjOBJ_TENDON,
+                objname=name,
+            )
     model = spec.compile()
     for joint in spec.joints:
         weight = float(model.dof_invweight0[model.joint(joint.name).dofadr[0]])
@@ -451,17 +542,21 @@ def _map_stiffness(spec: mujoco.MjSpec, parameters: Parameters, variant: Variant
             stiffness = v("carts.stop_stiffness" if joint.name in CARTS else "joints.stop_stiffness")
             # Critical damping of the joint's inertia 1/A and the row's virtual inertia together.
             critical = 2.0 * math.sqrt(stiffness / ((1.0 - STOP_IMPEDANCE) * weight))
-            joint.solref_limit = list(direct_solref(stiffness, v("joints.stop_damping_ratio") * critical,
-                                                    STOP_IMPEDANCE, weight))
+            joint.solref_limit = list(
+                direct_solref(stiffness, v("joints.stop_damping_ratio") * critical, STOP_IMPEDANCE, weight)
+            )
     if variant.transmission == "wires":
         for name in (MASTER, *SLAVES):
             stiffness = v("wires.master_stiffness" if name == MASTER else "wires.slave_stiffness")
             weight = float(model.tendon_invweight0[model.tendon(name).id])
-            spec.tendon(name).solref_limit = list(direct_solref(stiffness, v("wires.damping"), WIRE_IMPEDANCE, weight))
+            spec.tendon(name).solref_limit = list(
+                direct_solref(stiffness, v("wires.damping"), WIRE_IMPEDANCE, weight)
+            )
     else:
         weight = float(model.tendon_invweight0[model.tendon(DRIVE).id])
-        spec.equality(DRIVE).solref = list(direct_solref(v("wires.master_stiffness"), v("wires.damping"),
-                                                         WIRE_IMPEDANCE, weight))
+        spec.equality(DRIVE).solref = list(
+            direct_solref(v("wires.master_stiffness"), v("wires.damping"), WIRE_IMPEDANCE, weight)
+        )
     if grasp is not None:
         stiffness, damping = contact_stiffness(grasp)
         for pair in spec.pairs:

@@ -101,7 +101,12 @@ _ALL = (
         "total fingertip force on the object (the dynamometer)",
     ),
     Signal(
-        "stiffness_label", "stiffness/label", "std_msgs/msg/String", "", "data", "void, rigid, soft or not sure"
+        "stiffness_label",
+        "stiffness/label",
+        "std_msgs/msg/String",
+        "",
+        "data",
+        "void, rigid, soft or not sure",
     ),
     Signal(
         "stiffness_class",

@@ -29,8 +29,16 @@ def _inertial(parent: ET.Element, link: Link) -> None:
     inertial = ET.SubElement(parent, "inertial")
     ET.SubElement(inertial, "origin", xyz=_numbers(0.0, 0.0, link.com), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=_numbers(link.mass))
-    ET.SubElement(inertial, "inertia", ixx=_numbers(link.inertia[0]), ixy="0", ixz="0", iyy=_numbers(link.inertia[1]),
-                  iyz="0", izz=_numbers(link.inertia[2]))
+    ET.SubElement(
+        inertial,
+        "inertia",
+        ixx=_numbers(link.inertia[0]),
+        ixy="0",
+        ixz="0",
+        iyy=_numbers(link.inertia[1]),
+        iyz="0",
+        izz=_numbers(link.inertia[2]),
+    )
 
 
 def _capsule(parent: ET.Element, length: float, radius: float, material: str) -> None:
@@ -57,18 +65,28 @@ def _palm(parent: ET.Element, parameters: Parameters) -> None:
         length = math.sqrt(sum(c * c for c in along))
         pitch = math.atan2(math.hypot(along[0], along[1]), along[2])
         visual = ET.SubElement(parent, "visual")
-        ET.SubElement(visual, "origin", xyz=_numbers(*(0.5 * (a + b) for a, b in zip(start, end, strict=True))),
-                      rpy=_numbers(0.0, pitch, math.atan2(along[1], along[0])))
+        ET.SubElement(
+            visual,
+            "origin",
+            xyz=_numbers(*(0.5 * (a + b) for a, b in zip(start, end, strict=True))),
+            rpy=_numbers(0.0, pitch, math.atan2(along[1], along[0])),
+        )
         geometry = ET.SubElement(visual, "geometry")
-        ET.SubElement(geometry, "cylinder", length=_numbers(length),
-                      radius=_numbers(1.22 * value(parameters, f"geometry.{finger}_radius")))
+        ET.SubElement(
+            geometry,
+            "cylinder",
+            length=_numbers(length),
+            radius=_numbers(1.22 * value(parameters, f"geometry.{finger}_radius")),
+        )
         ET.SubElement(visual, "material", name="palm")
 
 
 def build_urdf(parameters: Parameters, thumb_stop_deg: float = 0) -> str:
     """The URDF text; raises HannesError for a missing parameter or an unknown thumb stop."""
     robot = ET.Element("robot", name="hannes")
-    robot.append(ET.Comment(" Generated: python -m hannes_description.urdf; x palmar, y radial, z distal; SI units. "))
+    robot.append(
+        ET.Comment(" Generated: python -m hannes_description.urdf; x palmar, y radial, z distal; SI units. ")
+    )
     for name, rgba in _MATERIALS.items():
         ET.SubElement(ET.SubElement(robot, "material", name=name), "color", rgba=rgba)
     _palm(ET.SubElement(robot, "link", name=ROOT), parameters)
@@ -79,16 +97,26 @@ def build_urdf(parameters: Parameters, thumb_stop_deg: float = 0) -> str:
             end = link.length + link.overhang - (link.radius if link.overhang else 0.0)
             _capsule(element, end, link.radius, "shell")
         fixed = link.joint is None
-        joint = ET.SubElement(robot, "joint", name=f"{link.name}_rot" if link.joint is None else link.joint.name,
-                              type="fixed" if fixed else "revolute")
+        joint = ET.SubElement(
+            robot,
+            "joint",
+            name=f"{link.name}_rot" if link.joint is None else link.joint.name,
+            type="fixed" if fixed else "revolute",
+        )
         ET.SubElement(joint, "parent", link=link.parent)
         ET.SubElement(joint, "child", link=link.name)
         ET.SubElement(joint, "origin", xyz=_numbers(*link.position), rpy=_numbers(*link.rpy))
         if link.joint is not None:
             limit = JOINT_LIMITS[link.joint.name]
             ET.SubElement(joint, "axis", xyz=_numbers(*link.joint.axis))
-            ET.SubElement(joint, "limit", lower=_numbers(limit.lower), upper=_numbers(limit.upper), effort="5",
-                          velocity="20")
+            ET.SubElement(
+                joint,
+                "limit",
+                lower=_numbers(limit.lower),
+                upper=_numbers(limit.upper),
+                effort="5",
+                velocity="20",
+            )
     ET.indent(robot, space="  ")
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 

@@ -16,6 +16,7 @@ from .problem import Coordinate, Problem
 
 Array = NDArray[np.float64]
 
+
 @dataclass(frozen=True)
 class SignalError:
     """Error of one signal in one condition.

@@ -196,7 +196,9 @@ def write_set(
     try:
         truth_file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise HannesError(f"No folder '{truth_file.parent}' for the truth: {error.strerror or error}.") from error
+        raise HannesError(
+            f"No folder '{truth_file.parent}' for the truth: {error.strerror or error}."
+        ) from error
     bags = [write_recording(r, folder / str(r.metadata["condition"]), compression="zstd") for r in recordings]
     truth_file.write_text(yaml.safe_dump(truth.to_dict(), sort_keys=False), encoding="utf-8")
     return bags

@@ -28,10 +28,25 @@ Part = Mapping[str, Any]
 INK, SOFT, LINE = "#1b1e23", "#5d6570", "#e2e4e7"
 BEFORE, AFTER, FLOOR = "#c8501a", "#1264a8", "#1c7a4a"
 TONES = {"nothing": FLOOR, "effects": AFTER, "unknown": "#a5571a", "other": "#49525e"}
-PHASE_TINTS = {"void": "#f3f7fb", "grasp": "#fbf1e4", "hold": "#fdf8f1", "opening": "#eff7f2", "rest": "#f6f6f6"}
+PHASE_TINTS = {
+    "void": "#f3f7fb",
+    "grasp": "#fbf1e4",
+    "hold": "#fdf8f1",
+    "opening": "#eff7f2",
+    "rest": "#f6f6f6",
+}
 HEAT = LinearSegmentedColormap.from_list("heat", ["#f0f1f3", "#de5a26"])
-STYLE = {"font.size": 9.0, "text.color": INK, "axes.labelcolor": SOFT, "axes.edgecolor": LINE, "xtick.color": SOFT,
-         "ytick.color": SOFT, "axes.linewidth": 0.8, "svg.fonttype": "path", "svg.hashsalt": "hannes"}
+STYLE = {
+    "font.size": 9.0,
+    "text.color": INK,
+    "axes.labelcolor": SOFT,
+    "axes.edgecolor": LINE,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "axes.linewidth": 0.8,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "hannes",
+}
 
 WIDTH, HEAD = 14.0, 1.15
 """Inches: the picture's width, and the height of its heading."""
@@ -42,8 +57,14 @@ MAX_CONDITIONS, MAX_SIGNALS = 4, 3
 Curve = Sequence[float | None]
 
 
-def write_picture(path: str | Path, *, comparison: Part | None, after: Part | None = None,
-                  diagnosis: Part | None = None, title: str = "") -> Path:
+def write_picture(
+    path: str | Path,
+    *,
+    comparison: Part | None,
+    after: Part | None = None,
+    diagnosis: Part | None = None,
+    title: str = "",
+) -> Path:
     """Write the picture as .png or .svg (also .pdf) and return its path.
 
     comparison, after, diagnosis  as for the report: dictionaries of Comparison and Diagnosis
@@ -51,7 +72,9 @@ def write_picture(path: str | Path, *, comparison: Part | None, after: Part | No
     """
     out = Path(path)
     if out.suffix.lower() not in (".png", ".svg", ".pdf"):
-        raise HannesError(f"A picture cannot be written as '{out.name}': the name must end in .png, .svg or .pdf.")
+        raise HannesError(
+            f"A picture cannot be written as '{out.name}': the name must end in .png, .svg or .pdf."
+        )
     figure = draw(comparison=comparison, after=after, diagnosis=diagnosis, title=title)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -64,8 +87,9 @@ def write_picture(path: str | Path, *, comparison: Part | None, after: Part | No
     return out
 
 
-def draw(*, comparison: Part | None, after: Part | None = None, diagnosis: Part | None = None,
-         title: str = "") -> Figure:
+def draw(
+    *, comparison: Part | None, after: Part | None = None, diagnosis: Part | None = None, title: str = ""
+) -> Figure:
     """The figure, on a canvas of its own: nothing global of matplotlib is touched but within this call."""
     if comparison is None:
         comparison, after = after, None
@@ -89,9 +113,17 @@ def _draw(comparison: Part | None, after: Part | None, diagnosis: Part | None, t
     FigureCanvasAgg(figure)
     _heading(figure, verdict_of(comparison, after, diagnosis), title, height)
     if lines:
-        grid = figure.add_gridspec(1, 1, left=0.055, right=0.985, top=1.0 - (HEAD + 0.25) / height,
-                                   bottom=1.0 - (HEAD + top) / height)
-        _overlays(figure, grid[0], overlays, list((after or {}).get("overlays") or []), conditions, signals, across)
+        grid = figure.add_gridspec(
+            1,
+            1,
+            left=0.055,
+            right=0.985,
+            top=1.0 - (HEAD + 0.25) / height,
+            bottom=1.0 - (HEAD + top) / height,
+        )
+        _overlays(
+            figure, grid[0], overlays, list((after or {}).get("overlays") or []), conditions, signals, across
+        )
     _below(figure, panels, height)
     return figure
 
@@ -111,20 +143,44 @@ class Panel:
 def _panels(fall: Part | None, maps: Sequence[Part], ranks: Part | None) -> list[Panel]:
     out = []
     if fall:
-        out.append(Panel("Held-out error, × repeatability", _inches([r["label"] for r in fall["rows"]]), 2.2, 0.3,
-                         max(1.3, 0.42 * len(fall["rows"])), partial(_fall, fall=fall)))
+        out.append(
+            Panel(
+                "Held-out error, × repeatability",
+                _inches([r["label"] for r in fall["rows"]]),
+                2.2,
+                0.3,
+                max(1.3, 0.42 * len(fall["rows"])),
+                partial(_fall, fall=fall),
+            )
+        )
     for k, m in enumerate(maps):
         rows = sum(len(g) for g in m["groups"].values()) + 0.35 * len(m["groups"])
         labels = 0.0 if k else _inches([_row_name(c, s) for c, g in m["groups"].items() for s in g])
         name = f"{m['kind'].capitalize()}: " if len(maps) > 1 else ""
         found = f"{m['fails']} of {m['all']} fail" if m["judged"] else "error, × repeatability"
-        out.append(Panel(f"{name}{found}", labels, 0.56 * len(m["phases"]), 0.25, 0.29 * rows,
-                         partial(_map, table=m, named=k == 0)))
+        out.append(
+            Panel(
+                f"{name}{found}",
+                labels,
+                0.56 * len(m["phases"]),
+                0.25,
+                0.29 * rows,
+                partial(_map, table=m, named=k == 0),
+            )
+        )
     if ranks:
         rows = ranks["first"]
         title = "What each effect alone explains" if ranks["excess"] else "Misfit left, × chance"
-        out.append(Panel(title, _inches([r["label"] for r in rows]), 1.6, 0.55, max(1.0, 0.27 * len(rows)),
-                         partial(_ranking, ranks=ranks)))
+        out.append(
+            Panel(
+                title,
+                _inches([r["label"] for r in rows]),
+                1.6,
+                0.55,
+                max(1.0, 0.27 * len(rows)),
+                partial(_ranking, ranks=ranks),
+            )
+        )
     return out
 
 
@@ -147,9 +203,17 @@ def _below(figure: Figure, panels: Sequence[Panel], height: float) -> None:
     x, top = 0.3, max(p.height for p in panels) + 0.3
     for p in panels:
         width = p.width * stretch
-        figure.text((x + (0.03 if p.labels else 0.0)) / WIDTH, (top + 0.32) / height, p.title, fontsize=9.5,
-                    weight="bold", va="bottom")
-        axes = figure.add_axes(((x + p.labels) / WIDTH, (top - p.height) / height, width / WIDTH, p.height / height))
+        figure.text(
+            (x + (0.03 if p.labels else 0.0)) / WIDTH,
+            (top + 0.32) / height,
+            p.title,
+            fontsize=9.5,
+            weight="bold",
+            va="bottom",
+        )
+        axes = figure.add_axes(
+            ((x + p.labels) / WIDTH, (top - p.height) / height, width / WIDTH, p.height / height)
+        )
         for spine in axes.spines.values():
             spine.set_visible(False)
         axes.tick_params(length=0, labelsize=8)
@@ -159,13 +223,21 @@ def _below(figure: Figure, panels: Sequence[Panel], height: float) -> None:
 
 def _heading(figure: Figure, verdict: Mapping[str, Any], title: str, height: float) -> None:
     tone = TONES[verdict["kind"]]
-    figure.text(0.018, 1.0 - 0.30 / height, _plain(title or verdict["label"]), color=tone, fontsize=10, weight="bold",
-                va="center")
+    figure.text(
+        0.018,
+        1.0 - 0.30 / height,
+        _plain(title or verdict["label"]),
+        color=tone,
+        fontsize=10,
+        weight="bold",
+        va="center",
+    )
     headline = _plain(verdict["headline"])
     size = 17 if len(headline) < 90 else 12 if len(headline) < 125 else 9
     figure.text(0.018, 1.0 - 0.64 / height, headline, fontsize=size, weight="bold", va="center")
-    key = "      ".join(f"{f['was'] + ' → ' if f['was'] else ''}{f['value']}  {f['label']}"
-                        for f in verdict["figures"][:3])
+    key = "      ".join(
+        f"{f['was'] + ' → ' if f['was'] else ''}{f['value']}  {f['label']}" for f in verdict["figures"][:3]
+    )
     figure.text(0.018, 1.0 - 0.98 / height, _plain(key), color=SOFT, fontsize=8.5, va="center")
     figure.add_artist(_stripe(tone))
 
@@ -179,8 +251,15 @@ def _plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def _overlays(figure: Figure, cell: Any, overlays: list[Part], later: list[Part], conditions: Sequence[str],
-              signals: Sequence[str], across: bool) -> None:
+def _overlays(
+    figure: Figure,
+    cell: Any,
+    overlays: list[Part],
+    later: list[Part],
+    conditions: Sequence[str],
+    signals: Sequence[str],
+    across: bool,
+) -> None:
     shape = (1, len(signals)) if across else (len(signals), len(conditions))
     outer = GridSpecFromSubplotSpec(*shape, subplot_spec=cell, hspace=0.34, wspace=0.2)
     for i, signal in enumerate(signals):
@@ -193,8 +272,13 @@ def _overlays(figure: Figure, cell: Any, overlays: list[Part], later: list[Part]
             inner = GridSpecFromSubplotSpec(2, 1, subplot_spec=place, height_ratios=(2.4, 1.0), hspace=0.08)
             upper, lower = figure.add_subplot(inner[0]), figure.add_subplot(inner[1])
             _overlay(upper, lower, o, a)
-            upper.set_title(_plain(f"{words(condition)}: {words(signal)}, {unit(o.get('unit', ''))}"), fontsize=9,
-                            loc="left", color=INK, pad=4)
+            upper.set_title(
+                _plain(f"{words(condition)}: {words(signal)}, {unit(o.get('unit', ''))}"),
+                fontsize=9,
+                loc="left",
+                color=INK,
+                pad=4,
+            )
             if across or i == len(signals) - 1:
                 lower.set_xlabel("s", loc="right", labelpad=-8)
             if i == 0 and j == 0:
@@ -209,7 +293,9 @@ def _overlay(upper: Axes, lower: Axes, overlay: Part, after: Part | None) -> Non
         models.append(("after", AFTER, at_times(series(after, "time"), series(after, "model"), t)))
     for axes in (upper, lower):
         for name, start, stop in runs([str(p) for p in overlay.get("phase", [])], t):
-            axes.axvspan(start, stop, facecolor=PHASE_TINTS.get(name, PHASE_TINTS["rest"]), linewidth=0.0, zorder=0)
+            axes.axvspan(
+                start, stop, facecolor=PHASE_TINTS.get(name, PHASE_TINTS["rest"]), linewidth=0.0, zorder=0
+            )
         axes.margins(x=0.0)
         axes.tick_params(length=2, labelsize=7.5, pad=2)
         for side in ("top", "right"):
@@ -217,8 +303,14 @@ def _overlay(upper: Axes, lower: Axes, overlay: Part, after: Part | None) -> Non
     upper.tick_params(labelbottom=False)
     upper.fill_between(_nan(t), _nan(low), _nan(high), color=INK, alpha=0.16, linewidth=0.0)
     upper.plot(_nan(t), _nan(measured), color=INK, alpha=0.38, linewidth=3.0, label="measured ±2 sd")
-    lower.fill_between(_nan(t), _nan(difference(low, measured)), _nan(difference(high, measured)), color=INK,
-                       alpha=0.16, linewidth=0.0)
+    lower.fill_between(
+        _nan(t),
+        _nan(difference(low, measured)),
+        _nan(difference(high, measured)),
+        color=INK,
+        alpha=0.16,
+        linewidth=0.0,
+    )
     for name, colour, values in models:
         upper.plot(_nan(t), _nan(values), color=colour, linewidth=1.2, label=name)
         lower.plot(_nan(t), _nan(difference(measured, values)), color=colour, linewidth=1.0)
@@ -246,8 +338,15 @@ def _fall(axes: Axes, fall: Mapping[str, Any]) -> None:
     axes.set_yticks(places, [_plain(r["label"]) for r in rows], color=INK)
     for place, value in zip(places, values, strict=True):
         if math.isfinite(value):
-            axes.annotate(ratio(value), (max(value, 1.0), place), xytext=(4, 0), textcoords="offset points",
-                          va="center", fontsize=8.5, weight="bold")
+            axes.annotate(
+                ratio(value),
+                (max(value, 1.0), place),
+                xytext=(4, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=8.5,
+                weight="bold",
+            )
     if fall["log"]:
         marks = log_ticks(left, max(finite) * 1.8, 5)
         axes.set_xticks(marks, [f"{m:g}" for m in marks])
@@ -267,8 +366,15 @@ def _map(axes: Axes, table: Mapping[str, Any], named: bool) -> None:
                 warm = heat(c.get("ratio"))
                 axes.add_patch(_cell(k, y, HEAT(warm or 0.0)))
                 mark = " •" if c.get("fails") else ""
-                axes.text(k, y, ratio(c.get("ratio")) + mark, ha="center", va="center", fontsize=7.5,
-                          weight="bold" if c.get("fails") else "normal")
+                axes.text(
+                    k,
+                    y,
+                    ratio(c.get("ratio")) + mark,
+                    ha="center",
+                    va="center",
+                    fontsize=7.5,
+                    weight="bold" if c.get("fails") else "normal",
+                )
             labels.append(_plain(_row_name(condition, signal)))
             places.append(y)
             y += 1.0

@@ -48,8 +48,16 @@ VARIABLE_UNITS = {"position": "rad", "velocity": "rad/s"}
 """Unit of each variable; `load` has that of the signal, the others have none."""
 
 
-def write_report(path: str | Path, *, comparison: Part | None, after: Part | None = None, diagnosis: Part | None = None,
-                 title: str = "Model against closures", command: str = "", created: str = "") -> Path:
+def write_report(
+    path: str | Path,
+    *,
+    comparison: Part | None,
+    after: Part | None = None,
+    diagnosis: Part | None = None,
+    title: str = "Model against closures",
+    command: str = "",
+    created: str = "",
+) -> Path:
     """Write the page and return its path.
 
     comparison  Comparison.to_dict() of the model as it was
@@ -58,8 +66,9 @@ def write_report(path: str | Path, *, comparison: Part | None, after: Part | Non
     command     what to run to get this page again; created: date and time as they are to be shown
     Raises HannesError if there is nothing to report or the file cannot be written.
     """
-    page = render_report(comparison=comparison, after=after, diagnosis=diagnosis, title=title, command=command,
-                         created=created)
+    page = render_report(
+        comparison=comparison, after=after, diagnosis=diagnosis, title=title, command=command, created=created
+    )
     out = Path(path)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -69,40 +78,79 @@ def write_report(path: str | Path, *, comparison: Part | None, after: Part | Non
     return out
 
 
-def render_report(*, comparison: Part | None, after: Part | None = None, diagnosis: Part | None = None,
-                  title: str = "Model against closures", command: str = "", created: str = "") -> str:
+def render_report(
+    *,
+    comparison: Part | None,
+    after: Part | None = None,
+    diagnosis: Part | None = None,
+    title: str = "Model against closures",
+    command: str = "",
+    created: str = "",
+) -> str:
     """The page as a text; see write_report."""
     if comparison is None:
         comparison, after = after, None
     if comparison is None and diagnosis is None:
         raise HannesError("There is nothing to report: neither a comparison nor a diagnosis was given.")
     scripts = {"uplot": _asset("uPlot.iife.min.js"), "page": _asset("report.js")}
-    data = {"title": title, "command": command, "created": created, "versions": versions(),
-            "comparison": comparison, "after": after, "diagnosis": diagnosis}
+    data = {
+        "title": title,
+        "command": command,
+        "created": created,
+        "versions": versions(),
+        "comparison": comparison,
+        "after": after,
+        "diagnosis": diagnosis,
+    }
     before_name, after_name = _model_names(comparison, after, diagnosis)
-    environment = Environment(loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined,
-                              trim_blocks=True, lstrip_blocks=True)
-    environment.filters.update(number=text.number, ratio=text.ratio, percent=text.percent, words=text.words,
-                               unit=text.unit, signed_percent=text.signed_percent, plus_minus=text.plus_minus,
-                               fixed=lambda v, n=2: text.DASH if text.known(v) is None else text.fixed(v, n))
+    environment = Environment(
+        loader=FileSystemLoader(HERE / "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        number=text.number,
+        ratio=text.ratio,
+        percent=text.percent,
+        words=text.words,
+        unit=text.unit,
+        signed_percent=text.signed_percent,
+        plus_minus=text.plus_minus,
+        fixed=lambda v, n=2: text.DASH if text.known(v) is None else text.fixed(v, n),
+    )
     sources = [part for part in (diagnosis, comparison) if part is not None]
     context = {
-        "title": title, "command": command, "created": created, "versions": data["versions"],
-        "before_name": before_name, "after_name": after_name, "both": after is not None,
-        "verdict": verdict_of(comparison, after, diagnosis), "fall": error_fall(diagnosis),
-        "conditions": overlay_groups(comparison, after), "maps": failure_maps(comparison, after),
-        "dependences": dependences(comparison, after, diagnosis), "effects": effects(diagnosis),
-        "tied": tied(diagnosis), "experiments": _list(diagnosis, "experiments"),
-        "separable": any((text.known(x.get("distance")) or 0.0) >= VISIBLE
-                         for x in _list(diagnosis, "experiments")),
+        "title": title,
+        "command": command,
+        "created": created,
+        "versions": data["versions"],
+        "before_name": before_name,
+        "after_name": after_name,
+        "both": after is not None,
+        "verdict": verdict_of(comparison, after, diagnosis),
+        "fall": error_fall(diagnosis),
+        "conditions": overlay_groups(comparison, after),
+        "maps": failure_maps(comparison, after),
+        "dependences": dependences(comparison, after, diagnosis),
+        "effects": effects(diagnosis),
+        "tied": tied(diagnosis),
+        "experiments": _list(diagnosis, "experiments"),
+        "separable": any(
+            (text.known(x.get("distance")) or 0.0) >= VISIBLE for x in _list(diagnosis, "experiments")
+        ),
         "ranking": ranking(diagnosis),
-        "metrics": metric_groups(comparison, after), "nuisances": nuisances(diagnosis),
+        "metrics": metric_groups(comparison, after),
+        "nuisances": nuisances(diagnosis),
         "data": _list(sources[0], "data") or _list(sources[-1], "data"),
         "notes": list(dict.fromkeys(str(n) for part in (*sources, after) for n in _list(part, "notes"))),
         "models": _models(comparison, after, diagnosis),
-        "json": Markup(embedded_json(data)), "scripts": {name: Markup(body) for name, body in scripts.items()},
+        "json": Markup(embedded_json(data)),
+        "scripts": {name: Markup(body) for name, body in scripts.items()},
         "styles": Markup(_asset("uPlot.min.css") + _asset("report.css")),
-        "policy": content_policy(scripts.values()), "uplot_licence": _asset("uPlot.LICENSE"),
+        "policy": content_policy(scripts.values()),
+        "uplot_licence": _asset("uPlot.LICENSE"),
     }
     return environment.get_template("report.html.j2").render(context)
 
@@ -117,7 +165,9 @@ def embedded_json(data: Any) -> str:
 
 def content_policy(scripts: Iterable[str]) -> str:
     """Nothing may be requested, and no script but these may run, whatever the data hold."""
-    hashes = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'" for s in scripts)
+    hashes = " ".join(
+        f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'" for s in scripts
+    )
     return f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
@@ -151,16 +201,29 @@ def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | No
     elif kind != "comparison":
         headline, kind = f"Verdict: {kind or 'none was given'}.", "other"
     elif overall is None:
-        headline = "The model beside the measurement; without repeated closures there is no scale to judge it by."
+        headline = (
+            "The model beside the measurement; without repeated closures there is no scale to judge it by."
+        )
     else:
-        headline = (f"The model misses the closures by {text.ratio(overall)} times what they differ among themselves."
-                    if overall > 1.2 else
-                    f"The model follows the closures to {text.ratio(overall)} times what they differ among themselves.")
-    label = {"nothing": "Complete", "effects": "Effects found" if len(names) > 1 else "Effect found",
-             "unknown": "Unknown effect", "comparison": "Comparison", "added": "Added"}.get(kind, "Verdict")
-    return {"kind": kind if kind in ("nothing", "effects", "unknown") else "other", "label": label,
-            "headline": headline, "summary": str(diagnosis.get("summary", "")) if diagnosis is not None else "",
-            "figures": _figures(comparison, after, diagnosis)}
+        headline = (
+            f"The model misses the closures by {text.ratio(overall)} times what they differ among themselves."
+            if overall > 1.2
+            else f"The model follows the closures to {text.ratio(overall)} times what they differ among themselves."
+        )
+    label = {
+        "nothing": "Complete",
+        "effects": "Effects found" if len(names) > 1 else "Effect found",
+        "unknown": "Unknown effect",
+        "comparison": "Comparison",
+        "added": "Added",
+    }.get(kind, "Verdict")
+    return {
+        "kind": kind if kind in ("nothing", "effects", "unknown") else "other",
+        "label": label,
+        "headline": headline,
+        "summary": str(diagnosis.get("summary", "")) if diagnosis is not None else "",
+        "figures": _figures(comparison, after, diagnosis),
+    }
 
 
 def lacking(diagnosis: Part | None, titles: Sequence[str]) -> str:
@@ -172,7 +235,9 @@ def lacking(diagnosis: Part | None, titles: Sequence[str]) -> str:
         return f"The model lacks {text.listed(titles)}."
     named = {str(e.get("name")): title for e, title in zip(_list(diagnosis, "effects"), titles, strict=True)}
     shared = [n for n in groups[0] if all(n in group for group in groups)]
-    options = [" with ".join(named.get(n, text.words(n)) for n in group if n not in shared) for group in groups]
+    options = [
+        " with ".join(named.get(n, text.words(n)) for n in group if n not in shared) for group in groups
+    ]
     either = text.listed([o for o in options if o], "or")
     sure = text.listed([named.get(n, text.words(n)) for n in shared])
     if sure:
@@ -185,32 +250,55 @@ def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None
     falls = _list(diagnosis, "falls")
     if len(falls) > 1:
         first = falls[1] if len(falls) > 2 else falls[0]
-        out.append({"value": text.ratio(falls[-1].get("held_out")), "was": text.ratio(first.get("held_out")),
-                    "label": f"held-out error, in multiples of the repeatability; before: {first.get('added', '')}"})
+        out.append(
+            {
+                "value": text.ratio(falls[-1].get("held_out")),
+                "was": text.ratio(first.get("held_out")),
+                "label": f"held-out error, in multiples of the repeatability; before: {first.get('added', '')}",
+            }
+        )
     elif comparison is not None:
         now = after if after is not None else comparison
-        out.append({"value": text.ratio(now.get("overall")),
-                    "was": text.ratio(comparison.get("overall")) if after is not None else "",
-                    "label": "error in multiples of the repeatability"})
+        out.append(
+            {
+                "value": text.ratio(now.get("overall")),
+                "was": text.ratio(comparison.get("overall")) if after is not None else "",
+                "label": "error in multiples of the repeatability",
+            }
+        )
     cells = _list(comparison, "cells")
     judged = [c for c in cells if text.known(c.get("p_value")) is not None]
     if judged:
         now_cells = _list(after, "cells") or cells
-        out.append({"value": f"{sum(bool(c.get('fails')) for c in now_cells)} of {len(now_cells)}",
-                    "was": str(sum(bool(c.get("fails")) for c in cells)) if after is not None else "",
-                    "label": "signals × phases beyond chance (5\u00a0% false discoveries)"})
+        out.append(
+            {
+                "value": f"{sum(bool(c.get('fails')) for c in now_cells)} of {len(now_cells)}",
+                "was": str(sum(bool(c.get("fails")) for c in cells)) if after is not None else "",
+                "label": "signals × phases beyond chance (5\u00a0% false discoveries)",
+            }
+        )
     data = _list(diagnosis, "data") or _list(comparison, "data")
     closures = [text.known(d.get("closures")) for d in data]
     if data and all(n is not None for n in closures):
         conditions = {str(c) for d in data for c in d.get("conditions", [])}
         total = sum(int(n) for n in closures if n is not None)
-        out.append({"value": str(total), "was": "",
-                    "label": f"{'closure' if total == 1 else 'closures'} of {len(conditions)} "
-                             f"{'condition' if len(conditions) == 1 else 'conditions'}"})
+        out.append(
+            {
+                "value": str(total),
+                "was": "",
+                "label": f"{'closure' if total == 1 else 'closures'} of {len(conditions)} "
+                f"{'condition' if len(conditions) == 1 else 'conditions'}",
+            }
+        )
     simulations = text.known((diagnosis or {}).get("simulations"))
     if simulations is not None:
-        out.append({"value": f"{simulations:,.0f}".replace(",", "\u202f"), "was": "",
-                    "label": "simulations run to find out"})
+        out.append(
+            {
+                "value": f"{simulations:,.0f}".replace(",", "\u202f"),
+                "was": "",
+                "label": "simulations run to find out",
+            }
+        )
     return out
 
 
@@ -220,8 +308,12 @@ def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:
     if not falls:
         return None
     conditions = list(dict.fromkeys(str(c) for f in falls for c in f.get("by_condition", {})))
-    values = [v for f in falls for v in map(text.known, (f.get("train"), f.get("held_out"),
-                                                          *f.get("by_condition", {}).values())) if v and v > 0.0]
+    values = [
+        v
+        for f in falls
+        for v in map(text.known, (f.get("train"), f.get("held_out"), *f.get("by_condition", {}).values()))
+        if v and v > 0.0
+    ]
     low, high = min([1.0, *values]), max([1.0, *values])
     log = high / low >= DECADES
     start, stop = (low / 1.5, high * 1.15) if log else (0.0, high * 1.08)
@@ -237,23 +329,44 @@ def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:
     for k, fall in enumerate(falls):
         added = str(fall.get("added", ""))
         by_condition = fall.get("by_condition", {})
-        rows.append({"label": added if k < 2 else f"+ {text.words(added)}", "kind": "before" if k < 2 else "after",
-                     "train": fall.get("train"), "held_out": fall.get("held_out"),
-                     "train_at": place(fall.get("train")), "held_out_at": place(fall.get("held_out")),
-                     "fitted": k > 0,
-                     "dots": [{"condition": c, "value": by_condition.get(c), "at": place(by_condition.get(c))}
-                              for c in conditions]})
-    signals = list(dict.fromkeys((str(s.get("condition")), str(s.get("signal")), str(s.get("unit", "")))
-                                 for f in falls for s in f.get("signals", [])))
+        rows.append(
+            {
+                "label": added if k < 2 else f"+ {text.words(added)}",
+                "kind": "before" if k < 2 else "after",
+                "train": fall.get("train"),
+                "held_out": fall.get("held_out"),
+                "train_at": place(fall.get("train")),
+                "held_out_at": place(fall.get("held_out")),
+                "fitted": k > 0,
+                "dots": [
+                    {"condition": c, "value": by_condition.get(c), "at": place(by_condition.get(c))}
+                    for c in conditions
+                ],
+            }
+        )
+    signals = list(
+        dict.fromkeys(
+            (str(s.get("condition")), str(s.get("signal")), str(s.get("unit", "")))
+            for f in falls
+            for s in f.get("signals", [])
+        )
+    )
     table: list[dict[str, Any]] = []
     for c, s, u in signals:
         steps: list[Part] = [
             next((e for e in f.get("signals", []) if (e.get("condition"), e.get("signal")) == (c, s)), {})
-            for f in falls]
+            for f in falls
+        ]
         table.append({"condition": c, "signal": s, "unit": u, "steps": steps})
     marks = text.log_ticks(start, stop) if log else text.ticks(start, stop)
-    return {"rows": rows, "log": log, "floor": place(1.0), "conditions": conditions, "table": table,
-            "ticks": [{"at": place(v) or 0.0, "label": tick_text(v)} for v in marks]}
+    return {
+        "rows": rows,
+        "log": log,
+        "floor": place(1.0),
+        "conditions": conditions,
+        "table": table,
+        "ticks": [{"at": place(v) or 0.0, "label": tick_text(v)} for v in marks],
+    }
 
 
 def overlay_groups(comparison: Part | None, after: Part | None) -> list[dict[str, Any]]:
@@ -266,9 +379,17 @@ def overlay_groups(comparison: Part | None, after: Part | None) -> list[dict[str
         overlay, j = overlays[k], later.get(key)
         before = _list(comparison, "errors")[errors[key]] if key in errors else {}
         now = _list(after, "errors")[errors_later[key]] if key in errors_later else None
-        groups.setdefault(key[0], []).append({
-            "index": k, "after": j, "signal": key[1], "unit": str(overlay.get("unit", "")), "before_error": before,
-            "after_error": now, "svg": overlay_svg(overlay, _list(after, "overlays")[j] if j is not None else None)})
+        groups.setdefault(key[0], []).append(
+            {
+                "index": k,
+                "after": j,
+                "signal": key[1],
+                "unit": str(overlay.get("unit", "")),
+                "before_error": before,
+                "after_error": now,
+                "svg": overlay_svg(overlay, _list(after, "overlays")[j] if j is not None else None),
+            }
+        )
     return [{"condition": name, "panels": panels} for name, panels in groups.items()]
 
 
@@ -286,10 +407,21 @@ def failure_maps(comparison: Part | None, after: Part | None) -> list[dict[str, 
         for condition, signal, _ in by:
             groups.setdefault(condition, {})[signal] = [
                 {**by[condition, signal, p], "heat": heat(by[condition, signal, p].get("ratio"))}
-                if (condition, signal, p) in by else None for p in phases]
-        out.append({"kind": kind, "phases": phases, "groups": groups, "cells": source,
-                    "fails": sum(bool(c.get("fails")) for c in source), "all": len(source),
-                    "judged": any(text.known(c.get("p_value")) is not None for c in source)})
+                if (condition, signal, p) in by
+                else None
+                for p in phases
+            ]
+        out.append(
+            {
+                "kind": kind,
+                "phases": phases,
+                "groups": groups,
+                "cells": source,
+                "fails": sum(bool(c.get("fails")) for c in source),
+                "all": len(source),
+                "judged": any(text.known(c.get("p_value")) is not None for c in source),
+            }
+        )
     return out
 
 
@@ -309,27 +441,40 @@ def dependences(comparison: Part | None, after: Part | None, diagnosis: Part | N
     rows = []
     for name in dict.fromkeys([*before, *later]):
         sources = [(kind, s[name]) for kind, s in (("before", before), ("after", later)) if name in s]
-        curves = [(kind, [text.known(v) for v in d.get("centres", [])], [text.known(v) for v in d.get("curve", [])])
-                  for kind, d in sources]
+        curves = [
+            (kind, [text.known(v) for v in d.get("centres", [])], [text.known(v) for v in d.get("curve", [])])
+            for kind, d in sources
+        ]
         signal = str(sources[0][1].get("signal", ""))
         signal_unit = _unit_of(signal, comparison, after)
         xs = [v for _, x, _ in curves for v in x if v is not None]
         ys = [v for _, _, y in curves for v in y if v is not None]
         steps = name == "direction"
         unit = signal_unit if name == "load" else VARIABLE_UNITS.get(name, "")
-        rows.append({
-            "name": name, "signal": signal, "unit": signal_unit, "variable_unit": unit,
-            "shares": {kind: d.get("share") for kind, d in sources},
-            "svg": curve_svg(curves, steps=steps) if len(xs) > 1 else None,
-            "ends": _ends(name, xs, unit), "top": max([0.0, *ys]), "bottom": min([0.0, *ys])})
+        rows.append(
+            {
+                "name": name,
+                "signal": signal,
+                "unit": signal_unit,
+                "variable_unit": unit,
+                "shares": {kind: d.get("share") for kind, d in sources},
+                "svg": curve_svg(curves, steps=steps) if len(xs) > 1 else None,
+                "ends": _ends(name, xs, unit),
+                "top": max([0.0, *ys]),
+                "bottom": min([0.0, *ys]),
+            }
+        )
     if not rows:
         return None
     key = "after" if later else "before"
     rows.sort(key=lambda r: -(text.known(r["shares"].get(key)) or 0.0))
     strongest = [r for r in rows if (text.known(r["shares"].get(key)) or 0.0) >= 0.05][:3]
-    return {"rows": rows, "signal": rows[0]["signal"],
-            "kinds": [k for k, s in (("before", before), ("after", later)) if s],
-            "strongest": [(r["name"], r["shares"][key]) for r in strongest]}
+    return {
+        "rows": rows,
+        "signal": rows[0]["signal"],
+        "kinds": [k for k, s in (("before", before), ("after", later)) if s],
+        "strongest": [(r["name"], r["shares"][key]) for r in strongest],
+    }
 
 
 def _ends(name: str, xs: Sequence[float], unit: str) -> list[str]:
@@ -347,13 +492,23 @@ def effects(diagnosis: Part | None) -> list[dict[str, Any]]:
     """The effects of the verdict, parameters with intervals on a power of ten that suits them."""
     out = []
     for effect in _list(diagnosis, "effects"):
-        parameters = [{"name": name, "identified": p.get("identified", True),
-                       **text.interval(p.get("value"), p.get("low"), p.get("high"), p.get("unit", ""))}
-                      for name, p in effect.get("parameters", {}).items()]
-        out.append({"name": str(effect.get("name", "")),
-                    "title": effect.get("title") or text.words(effect.get("name", "")),
-                    "source": effect.get("source"), "why": effect.get("why", ""),
-                    "parameters": parameters})
+        parameters = [
+            {
+                "name": name,
+                "identified": p.get("identified", True),
+                **text.interval(p.get("value"), p.get("low"), p.get("high"), p.get("unit", "")),
+            }
+            for name, p in effect.get("parameters", {}).items()
+        ]
+        out.append(
+            {
+                "name": str(effect.get("name", "")),
+                "title": effect.get("title") or text.words(effect.get("name", "")),
+                "source": effect.get("source"),
+                "why": effect.get("why", ""),
+                "parameters": parameters,
+            }
+        )
     return out
 
 
@@ -368,20 +523,33 @@ def ranking(diagnosis: Part | None) -> dict[str, Any] | None:
     rows = _list(diagnosis, "ranking")
     if diagnosis is None or not rows:
         return None
-    critical, nominal = (text.known((diagnosis.get("costs") or {}).get(k)) for k in ("critical", "nominal_fitted"))
+    critical, nominal = (
+        text.known((diagnosis.get("costs") or {}).get(k)) for k in ("critical", "nominal_fitted")
+    )
     # Below the critical value there is no misfit to share out: percentages of it would say nothing.
     excess = critical is None or nominal is None or nominal > critical
     found = {str(e.get("name")) for e in _list(diagnosis, "effects")}
     out = []
     for row in rows:
         cost, share = text.known(row.get("cost")), text.known(row.get("explained")) if excess else None
-        out.append({"label": " + ".join(text.words(n) for n in row.get("names", [])), "cost": cost, "explained": share,
-                    "of_chance": cost / critical if cost is not None and critical else None,
-                    "width": round(100.0 * min(1.0, max(0.0, share or 0.0)), 2),
-                    "found": set(row.get("names", [])) <= found and bool(found)})
-    return {"first": out[:RANKS], "rest": out[RANKS:], "critical": critical,
-            "draws": (diagnosis.get("chance") or {}).get("draws"), "excess": excess,
-            "nominal": nominal / critical if nominal is not None and critical else None}
+        out.append(
+            {
+                "label": " + ".join(text.words(n) for n in row.get("names", [])),
+                "cost": cost,
+                "explained": share,
+                "of_chance": cost / critical if cost is not None and critical else None,
+                "width": round(100.0 * min(1.0, max(0.0, share or 0.0)), 2),
+                "found": set(row.get("names", [])) <= found and bool(found),
+            }
+        )
+    return {
+        "first": out[:RANKS],
+        "rest": out[RANKS:],
+        "critical": critical,
+        "draws": (diagnosis.get("chance") or {}).get("draws"),
+        "excess": excess,
+        "nominal": nominal / critical if nominal is not None and critical else None,
+    }
 
 
 def metric_groups(comparison: Part | None, after: Part | None) -> list[dict[str, Any]]:
@@ -391,7 +559,8 @@ def metric_groups(comparison: Part | None, after: Part | None) -> list[dict[str,
     for row in _list(comparison, "metrics"):
         now = later.get((row.get("condition"), row.get("name")))
         groups.setdefault(str(row.get("condition", "")), []).append(
-            {"before": row, "after": now, "off_before": _off(row), "off_after": now is not None and _off(now)})
+            {"before": row, "after": now, "off_before": _off(row), "off_after": now is not None and _off(now)}
+        )
     return [{"condition": name, "rows": rows} for name, rows in groups.items()]
 
 
@@ -409,8 +578,14 @@ def nuisances(diagnosis: Part | None) -> dict[str, Any] | None:
     rows = []
     for name, row in table.items():
         z = text.known(row.get("prior_sds"))
-        rows.append({"name": name, "z": z, **{k: row.get(k) for k in ("value", "nominal", "low", "high")},
-                     "unit": str(row.get("unit", ""))})
+        rows.append(
+            {
+                "name": name,
+                "z": z,
+                **{k: row.get(k) for k in ("value", "nominal", "low", "high")},
+                "unit": str(row.get("unit", "")),
+            }
+        )
     if not rows:
         return None
     rows.sort(key=lambda r: -abs(r["z"] or 0.0))
@@ -420,8 +595,13 @@ def nuisances(diagnosis: Part | None) -> dict[str, Any] | None:
         row["far"] = row["z"] is not None and abs(row["z"]) > 2.0
     step = max(1, math.ceil(span / 4.0)) if span > 4.0 else 2
     marks = [k for k in range(-int(span), int(span) + 1) if k % step == 0]
-    return {"rows": rows, "usual": [50.0 - 100.0 / span, 200.0 / span],
-            "ticks": [{"at": 50.0 + 50.0 * k / span, "label": text.minus(f"{k:+d}" if k else "0")} for k in marks]}
+    return {
+        "rows": rows,
+        "usual": [50.0 - 100.0 / span, 200.0 / span],
+        "ticks": [
+            {"at": 50.0 + 50.0 * k / span, "label": text.minus(f"{k:+d}" if k else "0")} for k in marks
+        ],
+    }
 
 
 def _model_names(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> tuple[str, str]:
@@ -433,9 +613,20 @@ def _model_names(comparison: Part | None, after: Part | None, diagnosis: Part | 
 
 
 def _models(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> list[dict[str, str]]:
-    rows = [("before" if after is not None else "compared", comparison), ("after", after), ("diagnosed", diagnosis)]
-    out = [{"role": role, "name": str((part.get("model") or {}).get("name", "")),
-            "sha256": str((part.get("model") or {}).get("sha256", ""))} for role, part in rows if part is not None]
+    rows = [
+        ("before" if after is not None else "compared", comparison),
+        ("after", after),
+        ("diagnosed", diagnosis),
+    ]
+    out = [
+        {
+            "role": role,
+            "name": str((part.get("model") or {}).get("name", "")),
+            "sha256": str((part.get("model") or {}).get("sha256", "")),
+        }
+        for role, part in rows
+        if part is not None
+    ]
     return [m for m in out if m["name"] or m["sha256"]]
 
 

@@ -79,8 +79,11 @@ def path(xs: Values, ys: Values, x: Scale, y: Scale) -> str:
 
 def area(xs: Values, low: Values, high: Values, x: Scale, y: Scale) -> str:
     """The d attribute of a band."""
-    inside = [(a, b, c) for a, b, c in zip(xs, low, high, strict=False)
-              if a is not None and b is not None and c is not None]
+    inside = [
+        (a, b, c)
+        for a, b, c in zip(xs, low, high, strict=False)
+        if a is not None and b is not None and c is not None
+    ]
     if not inside:
         return ""
     there = [f"{x(a):.1f} {y(c):.1f}" for a, _, c in inside]
@@ -116,23 +119,46 @@ def overlay_svg(overlay: Mapping[str, Any], after: Mapping[str, Any] | None) -> 
     spread = [(difference(low, measured)), difference(high, measured)]
     r = Scale([*spread[0], *spread[1], *(v for _, m in residuals for v in m)], lower + RESIDUAL, lower)
     bottom = lower + RESIDUAL
-    out = [Markup('<svg class="static-plot" viewBox="0 0 {:g} {:g}" aria-hidden="true">')
-           .format(WIDTH, bottom + BOTTOM)]
+    out = [
+        Markup('<svg class="static-plot" viewBox="0 0 {:g} {:g}" aria-hidden="true">').format(
+            WIDTH, bottom + BOTTOM
+        )
+    ]
     for name, start, stop in runs([str(p) for p in overlay.get("phase", [])], t):
         a, b = x(start), x(stop)
-        out.append(Markup('<rect class="phase phase-{}" x="{:.1f}" y="{}" width="{:.1f}" height="{}"/>').format(
-            phase_class(name), a, TOP, b - a, bottom - TOP))
+        out.append(
+            Markup('<rect class="phase phase-{}" x="{:.1f}" y="{}" width="{:.1f}" height="{}"/>').format(
+                phase_class(name), a, TOP, b - a, bottom - TOP
+            )
+        )
         if b - a > 34.0:
-            out.append(Markup('<text x="{:.1f}" y="{}" class="phase-name">{}</text>').format(
-                (a + b) / 2.0, TOP - 6.0, name))
+            out.append(
+                Markup('<text x="{:.1f}" y="{}" class="phase-name">{}</text>').format(
+                    (a + b) / 2.0, TOP - 6.0, name
+                )
+            )
     for scale in (y, r):
         for value in ticks(scale.low, scale.high, 5 if scale is y else 3):
-            out.append(Markup('<line class="grid" x1="{}" x2="{}" y1="{:.1f}" y2="{:.1f}"/>'
-                              '<text class="tick-y" x="{}" y="{:.1f}">{}</text>').format(
-                LEFT, WIDTH - RIGHT, scale(value), scale(value), LEFT - 5.0, scale(value) + 3.5, tick_text(value)))
+            out.append(
+                Markup(
+                    '<line class="grid" x1="{}" x2="{}" y1="{:.1f}" y2="{:.1f}"/>'
+                    '<text class="tick-y" x="{}" y="{:.1f}">{}</text>'
+                ).format(
+                    LEFT,
+                    WIDTH - RIGHT,
+                    scale(value),
+                    scale(value),
+                    LEFT - 5.0,
+                    scale(value) + 3.5,
+                    tick_text(value),
+                )
+            )
     for value in ticks(x.low, x.high, 5):
-        out.append(Markup('<text class="tick-x" x="{:.1f}" y="{}">{}</text>').format(
-            x(value), bottom + 15.0, tick_text(value)))
+        out.append(
+            Markup('<text class="tick-x" x="{:.1f}" y="{}">{}</text>').format(
+                x(value), bottom + 15.0, tick_text(value)
+            )
+        )
     out.append(Markup('<text class="tick-x" x="{}" y="{}">s</text>').format(WIDTH - RIGHT, bottom + 15.0))
     lines = [("band", area(t, low, high, x, y)), ("measured", path(t, measured, x, y))]
     lines += [(name, path(t, m, x, y)) for name, m in models]
@@ -162,7 +188,9 @@ def tick_text(value: float) -> str:
     return text.rstrip("0").rstrip(".") if "." in text and "×" not in text else text
 
 
-def curve_svg(curves: Sequence[tuple[str, Sequence[float | None], Sequence[float | None]]], *, steps: bool) -> Markup:
+def curve_svg(
+    curves: Sequence[tuple[str, Sequence[float | None], Sequence[float | None]]], *, steps: bool
+) -> Markup:
     """Small curves of residual against a variable; stretched by the page, so lines only, no text.
 
     curves  (class, centres, values); steps: velocities stand for directions, one bar each
@@ -171,9 +199,12 @@ def curve_svg(curves: Sequence[tuple[str, Sequence[float | None], Sequence[float
     y = Scale([0.0, *(v for _, _, ys in curves for v in ys)], height - 6.0, 6.0, 0.0)
     x = Scale([v for _, xs, _ in curves for v in xs], 6.0, width - 6.0, 0.0)
     zero = y(0.0)
-    out = [Markup('<svg class="curve" viewBox="0 0 {:g} {:g}" preserveAspectRatio="none" aria-hidden="true">'
-                  '<line class="zero" x1="0" x2="{:g}" y1="{:.1f}" y2="{:.1f}"/>').format(
-        width, height, width, zero, zero)]
+    out = [
+        Markup(
+            '<svg class="curve" viewBox="0 0 {:g} {:g}" preserveAspectRatio="none" aria-hidden="true">'
+            '<line class="zero" x1="0" x2="{:g}" y1="{:.1f}" y2="{:.1f}"/>'
+        ).format(width, height, width, zero, zero)
+    ]
     for k, (name, xs, ys) in enumerate(curves):
         points = [(a, b) for a, b in zip(xs, ys, strict=False) if a is not None and b is not None]
         if steps:
@@ -181,10 +212,15 @@ def curve_svg(curves: Sequence[tuple[str, Sequence[float | None], Sequence[float
             for a, b in points:
                 third = 0 if a < -STANDING else 2 if a > STANDING else 1
                 at = width * (third + 0.5) / 3.0 + 12.0 * (k - (len(curves) - 1) / 2.0)
-                out.append(Markup('<path class="bar-{}" d="M{:.1f} {:.1f}V{:.1f}"/>').format(name, at, zero, y(b)))
+                out.append(
+                    Markup('<path class="bar-{}" d="M{:.1f} {:.1f}V{:.1f}"/>').format(name, at, zero, y(b))
+                )
             continue
         out.append(Markup('<path class="line-{}" d="{}"/>').format(name, path(xs, ys, x, y)))
         # A line of no length with round caps stays round however the picture is stretched.
-        out += [Markup('<path class="dot-{}" d="M{:.1f} {:.1f}h.01"/>').format(name, x(a), y(b)) for a, b in points]
+        out += [
+            Markup('<path class="dot-{}" d="M{:.1f} {:.1f}h.01"/>').format(name, x(a), y(b))
+            for a, b in points
+        ]
     out.append(Markup("</svg>"))
     return Markup("").join(out)

@@ -98,7 +98,9 @@ def plus_minus(value: Any, sd: Any, digits: int = 3) -> str:
 
 def unit(text: Any) -> str:
     """N.m/rad3 -> N·m/rad³."""
-    return re.sub(r"(?<=[A-Za-z])(-?\d+)", lambda m: m.group(1).translate(_SUPERSCRIPT), str(text).replace(".", "·"))
+    return re.sub(
+        r"(?<=[A-Za-z])(-?\d+)", lambda m: m.group(1).translate(_SUPERSCRIPT), str(text).replace(".", "·")
+    )
 
 
 def interval(value: Any, low: Any, high: Any, unit_text: Any) -> dict[str, str]:
@@ -117,10 +119,12 @@ def interval(value: Any, low: Any, high: Any, unit_text: Any) -> dict[str, str]:
     scale = 10.0**exponent
     half = (b - a) / 2.0 / scale if a is not None and b is not None else 0.0
     places = min(6, max(0, decimals(half, 2))) if half > 0.0 else max(0, decimals(v / scale, 4))
-    return {"value": fixed(v / scale, places),
-            "low": DASH if a is None else fixed(a / scale, places),
-            "high": DASH if b is None else fixed(b / scale, places),
-            "unit": f"{superscript(exponent)} {pretty}".strip() if exponent else pretty}
+    return {
+        "value": fixed(v / scale, places),
+        "low": DASH if a is None else fixed(a / scale, places),
+        "high": DASH if b is None else fixed(b / scale, places),
+        "unit": f"{superscript(exponent)} {pretty}".strip() if exponent else pretty,
+    }
 
 
 def words(name: Any) -> str:

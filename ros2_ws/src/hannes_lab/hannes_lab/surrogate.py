@@ -90,9 +90,7 @@ class AnchoredRig:
         slopes = dict(zip((c.name for c in coordinates), self._new_slopes(coordinates), strict=True))
         return self._like(self._model, self._values, {**self._slopes, **slopes})
 
-    def _like(
-        self, model: Model, values: Mapping[str, float], slopes: Mapping[str, _Slope]
-    ) -> AnchoredRig:
+    def _like(self, model: Model, values: Mapping[str, float], slopes: Mapping[str, _Slope]) -> AnchoredRig:
         made = AnchoredRig(self.exact, model, values, slopes, self._corrections, self.threads, self._ends)
         made._exacts = self._exacts
         return made
@@ -246,7 +244,9 @@ def rig_for(rig: Rig, model: Model, coordinates: Sequence[Coordinate], threads: 
     where the truth is expected.  Across a wide prior a slope at its middle would lead astray.
     """
     if model.plant in SLOW_PLANTS and isinstance(rig, PlantRig):
-        return AnchoredRig(rig, model, {}, threads=threads).sloped([c for c in coordinates if c.step >= KNOWN_WELL])
+        return AnchoredRig(rig, model, {}, threads=threads).sloped(
+            [c for c in coordinates if c.step >= KNOWN_WELL]
+        )
     return rig
 
 

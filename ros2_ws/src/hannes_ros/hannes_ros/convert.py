@@ -74,8 +74,12 @@ def to_ns(stamp: Time) -> int:
 # -- joints ----------------------------------------------------------------------------------------------------------
 def joint_message(names: Sequence[str], sample: JointSample) -> JointState:
     """The message of a sample of the named joints."""
-    message = JointState(name=list(names), position=list(sample.position), velocity=list(sample.velocity),
-                         effort=list(sample.effort))
+    message = JointState(
+        name=list(names),
+        position=list(sample.position),
+        velocity=list(sample.velocity),
+        effort=list(sample.effort),
+    )
     message.header.stamp = to_time(sample.stamp_ns)
     return message
 
@@ -88,12 +92,18 @@ def joint_sample(names: Sequence[str], message: JointState) -> JointSample:
     if list(message.name) != list(names):
         raise HannesError(f"the joints are {list(message.name)}, expected {list(names)}")
     count = len(names)
-    if len(message.position) != count or len(message.velocity) not in (0, count) \
-            or len(message.effort) not in (0, count):
-        raise HannesError(f"position, velocity and effort have {len(message.position)}, {len(message.velocity)} and "
-                          f"{len(message.effort)} entries, expected {count} each (velocity and effort may be empty)")
-    return JointSample(to_ns(message.header.stamp), tuple(message.position), tuple(message.velocity),
-                       tuple(message.effort))
+    if (
+        len(message.position) != count
+        or len(message.velocity) not in (0, count)
+        or len(message.effort) not in (0, count)
+    ):
+        raise HannesError(
+            f"position, velocity and effort have {len(message.position)}, {len(message.velocity)} and "
+            f"{len(message.effort)} entries, expected {count} each (velocity and effort may be empty)"
+        )
+    return JointSample(
+        to_ns(message.header.stamp), tuple(message.position), tuple(message.velocity), tuple(message.effort)
+    )
 
 
 def _string(text: str) -> bytes:
@@ -113,32 +123,60 @@ class JointCodec:
         self.names = tuple(names)
         count = len(self.names)
         # All that never changes between the stamp and the first position: frame_id, names, length of position.
-        between = _string("") + struct.pack("<I", count) + b"".join(_string(name) for name in self.names) \
+        between = (
+            _string("")
             + struct.pack("<I", count)
+            + b"".join(_string(name) for name in self.names)
+            + struct.pack("<I", count)
+        )
         self._between = between + bytes(-len(between) % 8)
         self._length = struct.pack("<I4x", count)
         self._tail = (self._length,) if effort else ()
         self._end = () if effort else (struct.pack("<I", 0),)
         block = f"8s{count}d"
-        self._struct = struct.Struct(f"<4siI{len(self._between)}s{count}d{block}" + (block if effort else "4s"))
+        self._struct = struct.Struct(
+            f"<4siI{len(self._between)}s{count}d{block}" + (block if effort else "4s")
+        )
         # Places of the constant parts in the unpacked tuple, and of the values between them.
         self._second, self._third = 4 + count, 5 + 2 * count
 
-    def encode(self, stamp_ns: int, position: Sequence[float], velocity: Sequence[float],
-               effort: Sequence[float] = ()) -> bytes:
+    def encode(
+        self,
+        stamp_ns: int,
+        position: Sequence[float],
+        velocity: Sequence[float],
+        effort: Sequence[float] = (),
+    ) -> bytes:
         """A serialised JointState; each sequence has one number for each joint (no effort if the codec has none)."""
-        return self._struct.pack(_HEADER, *divmod(stamp_ns, _GIGA), self._between, *position, self._length, *velocity,
-                                 *self._tail, *effort, *self._end)
+        return self._struct.pack(
+            _HEADER,
+            *divmod(stamp_ns, _GIGA),
+            self._between,
+            *position,
+            self._length,
+            *velocity,
+            *self._tail,
+            *effort,
+            *self._end,
+        )
 
     def decode(self, data: bytes) -> JointSample:
         """The sample in a serialised JointState; HannesError as `joint_sample`."""
         if len(data) == self._struct.size:
             parts = self._struct.unpack(data)
             second, third = self._second, self._third
-            if parts[0] == _HEADER and parts[3] == self._between and parts[second] == self._length \
-                    and parts[third:third + 1] == (self._tail or self._end):
-                return JointSample(parts[1] * _GIGA + parts[2], parts[4:second], parts[second + 1:third],
-                                   parts[third + 1:])
+            if (
+                parts[0] == _HEADER
+                and parts[3] == self._between
+                and parts[second] == self._length
+                and parts[third : third + 1] == (self._tail or self._end)
+            ):
+                return JointSample(
+                    parts[1] * _GIGA + parts[2],
+                    parts[4:second],
+                    parts[second + 1 : third],
+                    parts[third + 1 :],
+                )
         return joint_sample(self.names, deserialize_message(data, JointState))
 
 

@@ -15,7 +15,12 @@ from rclpy.node import Node
 
 from .topics import diagnostics_publisher
 
-OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE)
+OK, WARN, ERROR, STALE = (
+    DiagnosticStatus.OK,
+    DiagnosticStatus.WARN,
+    DiagnosticStatus.ERROR,
+    DiagnosticStatus.STALE,
+)
 
 MISSED_WARN, MISSED_ERROR = 0.01, 0.1
 """Share of missed cycles from which a node warns, and from which it reports an error."""
@@ -62,8 +67,13 @@ class Diagnostics:
     A loop that missed more cycles than MISSED_WARN or MISSED_ERROR since the last report raises the level.
     """
 
-    def __init__(self, node: Node, health: Health,
-                 state: Callable[[], tuple[bytes, str, Mapping[str, object]]], period: float = 1.0) -> None:
+    def __init__(
+        self,
+        node: Node,
+        health: Health,
+        state: Callable[[], tuple[bytes, str, Mapping[str, object]]],
+        period: float = 1.0,
+    ) -> None:
         self._node, self._health, self._state = node, health, state
         self._publisher = diagnostics_publisher(node)
         self._rate = Rate(monotonic())
@@ -77,14 +87,26 @@ class Diagnostics:
         (done, missed), self._before = self._before, (health.cycles, health.missed)
         done, missed = health.cycles - done, health.missed - missed
         if missed_level(done, missed) > level:
-            level, message = missed_level(done, missed), f"{message}; missed {missed} of {done + missed} cycles"
+            level, message = (
+                missed_level(done, missed),
+                f"{message}; missed {missed} of {done + missed} cycles",
+            )
         age = "" if health.last_input is None else f"{now - health.last_input:.3f}"
-        pairs: dict[str, object] = {"rate_hz": f"{self._rate.update(now, health.cycles):.1f}",
-                                    "cycles": health.cycles, "missed_cycles": health.missed,
-                                    "input_age_s": age, **health.counts, **values}
-        status = DiagnosticStatus(level=level, name=self._node.get_fully_qualified_name(), message=message,
-                                  hardware_id="hannes",
-                                  values=[KeyValue(key=key, value=str(value)) for key, value in pairs.items()])
+        pairs: dict[str, object] = {
+            "rate_hz": f"{self._rate.update(now, health.cycles):.1f}",
+            "cycles": health.cycles,
+            "missed_cycles": health.missed,
+            "input_age_s": age,
+            **health.counts,
+            **values,
+        }
+        status = DiagnosticStatus(
+            level=level,
+            name=self._node.get_fully_qualified_name(),
+            message=message,
+            hardware_id="hannes",
+            values=[KeyValue(key=key, value=str(value)) for key, value in pairs.items()],
+        )
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)

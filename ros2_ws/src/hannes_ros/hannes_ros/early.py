@@ -10,8 +10,18 @@ import os
 import signal
 import sys
 
-_PROGRAMS = frozenset({"hand_sim", "motor_controller", "emg_reference", "emg_source", "stiffness_classifier",
-                       "recorder", "player", "hannes_composed"})
+_PROGRAMS = frozenset(
+    {
+        "hand_sim",
+        "motor_controller",
+        "emg_reference",
+        "emg_source",
+        "stiffness_classifier",
+        "recorder",
+        "player",
+        "hannes_composed",
+    }
+)
 
 
 def leave_at_once(number: int, frame: object) -> None:

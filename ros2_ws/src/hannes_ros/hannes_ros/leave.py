@@ -12,8 +12,14 @@ _SIGEV_THREAD = 2
 class _Event(ctypes.Structure):
     """struct sigevent of Linux with glibc, 64 bytes; for SIGEV_THREAD `function` is called with `value`."""
 
-    _fields_ = (("value", ctypes.c_void_p), ("signal", ctypes.c_int), ("notify", ctypes.c_int),
-                ("function", ctypes.c_void_p), ("attributes", ctypes.c_void_p), ("rest", ctypes.c_char * 32))
+    _fields_ = (
+        ("value", ctypes.c_void_p),
+        ("signal", ctypes.c_int),
+        ("notify", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("attributes", ctypes.c_void_p),
+        ("rest", ctypes.c_char * 32),
+    )
 
 
 class _Times(ctypes.Structure):

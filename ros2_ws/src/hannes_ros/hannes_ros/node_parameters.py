@@ -29,8 +29,15 @@ _OWN_TO_ROS = ("use_sim_time", "start_type_description_service", "qos_overrides"
 _TYPES = {bool: "true or false", int: "an integer", float: "a number", str: "text", list: "a list of texts"}
 
 
-def parameter(default: Any, description: str, *, lower: float | None = None, upper: float | None = None,
-              choices: Sequence[str] = (), unit: str = "") -> Any:
+def parameter(
+    default: Any,
+    description: str,
+    *,
+    lower: float | None = None,
+    upper: float | None = None,
+    choices: Sequence[str] = (),
+    unit: str = "",
+) -> Any:
     """A dataclass field that is a ROS parameter.
 
     default      bool, int, float, str or tuple of str; its type is the parameter's type
@@ -38,8 +45,16 @@ def parameter(default: Any, description: str, *, lower: float | None = None, upp
     lower upper  inclusive range of a number, in `unit`
     choices      valid texts
     """
-    return field(default=default, metadata={"description": description, "lower": lower, "upper": upper,
-                                            "choices": tuple(choices), "unit": unit})
+    return field(
+        default=default,
+        metadata={
+            "description": description,
+            "lower": lower,
+            "upper": upper,
+            "choices": tuple(choices),
+            "unit": unit,
+        },
+    )
 
 
 def _plain(item: Field[Any]) -> Any:
@@ -60,12 +75,16 @@ def _descriptor(item: Field[Any]) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(description=_describe(item), read_only=True, dynamic_typing=empty_list)
     lower, upper = item.metadata["lower"], item.metadata["upper"]
     if isinstance(item.default, float) and (lower is not None or upper is not None):
-        descriptor.floating_point_range = [FloatingPointRange(
-            from_value=-math.inf if lower is None else float(lower),
-            to_value=math.inf if upper is None else float(upper))]
+        descriptor.floating_point_range = [
+            FloatingPointRange(
+                from_value=-math.inf if lower is None else float(lower),
+                to_value=math.inf if upper is None else float(upper),
+            )
+        ]
     elif isinstance(item.default, int) and not isinstance(item.default, bool) and lower is not None:
-        descriptor.integer_range = [IntegerRange(from_value=int(lower),
-                                                 to_value=2**62 if upper is None else int(upper))]
+        descriptor.integer_range = [
+            IntegerRange(from_value=int(lower), to_value=2**62 if upper is None else int(upper))
+        ]
     return descriptor
 
 
@@ -76,8 +95,10 @@ def _check(node_name: str, item: Field[Any], value: Any) -> None:
     lower, upper = meta["lower"], meta["upper"]
     if (lower is not None and value < lower) or (upper is not None and value > upper):
         unit = f" {meta['unit']}" if meta["unit"] else ""
-        raise HannesError(f"{where} is {value}; it must be between {'-inf' if lower is None else lower} and "
-                          f"{'inf' if upper is None else upper}{unit}.")
+        raise HannesError(
+            f"{where} is {value}; it must be between {'-inf' if lower is None else lower} and "
+            f"{'inf' if upper is None else upper}{unit}."
+        )
     if meta["choices"]:
         for text in value if isinstance(value, list) else [value]:
             if text not in meta["choices"]:
@@ -94,8 +115,9 @@ def declare(node: Node, cls: type[T]) -> T:
     items = {item.name: item for item in dataclasses.fields(cls)}  # type: ignore[arg-type]
     unknown = sorted(name for name in given if name not in items and name.split(".")[0] not in _OWN_TO_ROS)
     if unknown:
-        raise HannesError(f"Node '{node.get_name()}' has no parameter '{unknown[0]}'; valid are "
-                          f"{', '.join(items)}.")
+        raise HannesError(
+            f"Node '{node.get_name()}' has no parameter '{unknown[0]}'; valid are {', '.join(items)}."
+        )
     values: dict[str, Any] = {}
     for name, item in items.items():
         default = _plain(item)
@@ -104,13 +126,18 @@ def declare(node: Node, cls: type[T]) -> T:
         if name in given:
             wanted = Parameter(name, value=default if default != [] else [""]).type_
             if given[name].type_ != wanted:
-                raise HannesError(f"Parameter '{name}' of node '{node.get_name()}' is {given[name].value!r}; it must "
-                                  f"be {_TYPES[type(default)]}.")
+                raise HannesError(
+                    f"Parameter '{name}' of node '{node.get_name()}' is {given[name].value!r}; it must "
+                    f"be {_TYPES[type(default)]}."
+                )
             _check(node.get_name(), item, given[name].value if default != [] else list(given[name].value))
         try:
             value = node.declare_parameter(name, default, _descriptor(item)).value
-        except (InvalidParameterTypeException, InvalidParameterValueException,
-                ParameterUninitializedException) as error:
+        except (
+            InvalidParameterTypeException,
+            InvalidParameterValueException,
+            ParameterUninitializedException,
+        ) as error:
             raise HannesError(f"Parameter '{name}' of node '{node.get_name()}': {error}") from None
         values[name] = tuple(value) if isinstance(default, list) else value
     return cls(**values)
@@ -121,7 +148,10 @@ def help_text(cls: type) -> str:
     lines = []
     for item in dataclasses.fields(cls):
         lower, upper = item.metadata["lower"], item.metadata["upper"]
-        span = "" if lower is None and upper is None else \
-            f" ({'' if lower is None else f'{lower:g}'}..{'' if upper is None else f'{upper:g}'})"
+        span = (
+            ""
+            if lower is None and upper is None
+            else f" ({'' if lower is None else f'{lower:g}'}..{'' if upper is None else f'{upper:g}'})"
+        )
         lines.append(f"  {item.name} := {_plain(item)!r}\n      {_describe(item)}{span}")
     return "\n".join(lines)

@@ -83,7 +83,9 @@ def _run(names: Sequence[str], executor: str, arguments: list[str]) -> int:
             spinner.spin_once(_SPIN_S)
         code = 0
     except HannesError as raised:
-        error = raised  # kept: with it goes a node that was made in part, which may take for ever (see _LEAVE_S)
+        error = (
+            raised  # kept: with it goes a node that was made in part, which may take for ever (see _LEAVE_S)
+        )
     finally:
         for node in reversed(nodes):
             node.stop()
@@ -131,8 +133,10 @@ def _init(arguments: list[str]) -> Context:
     except RuntimeError as error:  # all that rclpy raises for a command line or a parameter file
         raise HannesError(f"ROS arguments are not valid: {_first_line(error)}") from None
     if others:
-        raise HannesError(f"Unknown argument '{others[0]}'; give parameters as '--ros-args -p name:=value' "
-                          "(--help lists them).")
+        raise HannesError(
+            f"Unknown argument '{others[0]}'; give parameters as '--ros-args -p name:=value' "
+            "(--help lists them)."
+        )
     return get_default_context()
 
 
@@ -147,13 +151,17 @@ def _node_rules(arguments: list[str], names: Sequence[str]) -> tuple[list[str], 
     position = 0
     while position < len(arguments):
         argument = arguments[position]
-        rule = arguments[position + 1] if argument in ("-p", "--param") and position + 1 < len(arguments) else ""
+        rule = (
+            arguments[position + 1] if argument in ("-p", "--param") and position + 1 < len(arguments) else ""
+        )
         node, colon, parameter = rule.partition(":=")[0].partition(":")
         if colon and "/" not in node:
             if node not in local:
-                raise HannesError(f"There is no node '{node}' in this process ('{argument} {rule}'); there "
-                                  f"is {', '.join(names)}.")
-            local[node] += ["--ros-args", "-p", parameter + rule[rule.index(":="):], "--"]
+                raise HannesError(
+                    f"There is no node '{node}' in this process ('{argument} {rule}'); there "
+                    f"is {', '.join(names)}."
+                )
+            local[node] += ["--ros-args", "-p", parameter + rule[rule.index(":=") :], "--"]
             position += 2
         else:
             rest.append(argument)

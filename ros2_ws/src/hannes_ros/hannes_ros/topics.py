@@ -26,12 +26,14 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 CLOCK_TOPIC: Final = "/clock"
 DIAGNOSTICS_TOPIC: Final = "/diagnostics"
 
-MESSAGE_TYPES: Final[Mapping[str, type]] = MappingProxyType({
-    "std_msgs/msg/Float64": Float64,
-    "std_msgs/msg/Float64MultiArray": Float64MultiArray,
-    "std_msgs/msg/String": String,
-    "sensor_msgs/msg/JointState": JointState,
-})
+MESSAGE_TYPES: Final[Mapping[str, type]] = MappingProxyType(
+    {
+        "std_msgs/msg/Float64": Float64,
+        "std_msgs/msg/Float64MultiArray": Float64MultiArray,
+        "std_msgs/msg/String": String,
+        "sensor_msgs/msg/JointState": JointState,
+    }
+)
 """Message class by ROS type name, for every type that a signal uses."""
 
 _EACH_TICK: Final = frozenset({"reference_position", "motor/state", "motor/current", "motor/voltage"})
@@ -40,8 +42,12 @@ _SLOW_DEPTH: Final = 300
 
 
 def _reliable(depth: int) -> QoSProfile:
-    return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE,
-                      durability=DurabilityPolicy.VOLATILE)
+    return QoSProfile(
+        depth=depth,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.VOLATILE,
+    )
 
 
 CLOCK_QOS: Final = _reliable(_TICK_DEPTH)
@@ -73,12 +79,14 @@ def publisher(node: Node, name: str, on_match: Callable[[Any], None] | None = No
     return node.create_publisher(message_type(name), signal(name).topic, qos(name), event_callbacks=events)
 
 
-def subscription(node: Node, name: str, callback: Callable[[bytes], None],
-                 on_match: Callable[[Any], None] | None = None) -> Subscription:
+def subscription(
+    node: Node, name: str, callback: Callable[[bytes], None], on_match: Callable[[Any], None] | None = None
+) -> Subscription:
     """Subscription of the signal's topic that hands over serialised messages (decode them with `convert`)."""
     events = SubscriptionEventCallbacks(matched=on_match) if on_match else None
-    return node.create_subscription(message_type(name), signal(name).topic, callback, qos(name),
-                                    event_callbacks=events, raw=True)
+    return node.create_subscription(
+        message_type(name), signal(name).topic, callback, qos(name), event_callbacks=events, raw=True
+    )
 
 
 def clock_publisher(node: Node, on_match: Callable[[Any], None] | None = None) -> Publisher:

@@ -104,13 +104,32 @@ from .ports import (
 )  # fmt: skip
 
 # Parameters of this plant, after the common ones
-_RADIUS, _COULOMB, _VISCOUS, _TIP, _WIRE_K, _WIRE_B, _WIRE_GAIN, _OBJECT_K, _OBJECT_B \
-    = range(N_PARAMETERS_COMMON, N_PARAMETERS_COMMON + 9)
+_RADIUS, _COULOMB, _VISCOUS, _TIP, _WIRE_K, _WIRE_B, _WIRE_GAIN, _OBJECT_K, _OBJECT_B = range(
+    N_PARAMETERS_COMMON, N_PARAMETERS_COMMON + 9
+)
 _N_PARAMETERS = N_PARAMETERS_COMMON + 9
 
 # Entries of the handle after the common ones: addresses of MuJoCo's structs and arrays
-_MODEL, _DATA, _STEP, _COUNTS, _QPOS, _QVEL, _APPLIED, _FRICTION, _DAMPING, _ARMATURE, _WIRE_RANGE, _WIRE_SOLREF, \
-    _PAIR_SOLREF, _PAIR_SOLIMP, _SENSORS, _WARNINGS, _TABLE, _MASS = range(N_HANDLE_COMMON, N_HANDLE_COMMON + 18)
+(
+    _MODEL,
+    _DATA,
+    _STEP,
+    _COUNTS,
+    _QPOS,
+    _QVEL,
+    _APPLIED,
+    _FRICTION,
+    _DAMPING,
+    _ARMATURE,
+    _WIRE_RANGE,
+    _WIRE_SOLREF,
+    _PAIR_SOLREF,
+    _PAIR_SOLIMP,
+    _SENSORS,
+    _WARNINGS,
+    _TABLE,
+    _MASS,
+) = range(N_HANDLE_COMMON, N_HANDLE_COMMON + 18)
 _N_HANDLE = N_HANDLE_COMMON + 18
 
 # Counts: int64
@@ -125,9 +144,17 @@ _N_IMPEDANCE = mujoco.mjNIMP
 _FASTEST = 1e4
 """rad/s or m/s; beyond it the simulation has diverged."""
 
-_FATAL = tuple(int(w) for w in (mujoco.mjtWarning.mjWARN_INERTIA, mujoco.mjtWarning.mjWARN_CONTACTFULL,
-                                mujoco.mjtWarning.mjWARN_CNSTRFULL, mujoco.mjtWarning.mjWARN_BADQPOS,
-                                mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC))
+_FATAL = tuple(
+    int(w)
+    for w in (
+        mujoco.mjtWarning.mjWARN_INERTIA,
+        mujoco.mjtWarning.mjWARN_CONTACTFULL,
+        mujoco.mjtWarning.mjWARN_CNSTRFULL,
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+    )
+)
 _WARNING_SHIFT = 32  # mjWarningStat is (int lastinfo, int number); the count is the upper half of an int64
 _N_WARNINGS = len(_FATAL)
 
@@ -138,7 +165,11 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
     count, table = pointer_i8(handle[_COUNTS]), pointer_f8(handle[_TABLE])
     qpos, qvel, applied = pointer_f8(handle[_QPOS]), pointer_f8(handle[_QVEL]), pointer_f8(handle[_APPLIED])
     friction, damping = pointer_f8(handle[_FRICTION]), pointer_f8(handle[_DAMPING])
-    armature, mass, sensors = pointer_f8(handle[_ARMATURE]), pointer_f8(handle[_MASS]), pointer_f8(handle[_SENSORS])
+    armature, mass, sensors = (
+        pointer_f8(handle[_ARMATURE]),
+        pointer_f8(handle[_MASS]),
+        pointer_f8(handle[_SENSORS]),
+    )
     r, motor = p[_RADIUS], count[_C_MOTOR]
     wires = count[_C_WIRES] != 0
     q = ql = v = vl = bad = 0.0
@@ -233,10 +264,18 @@ if mujoco.get_mju_user_warning() is None:
     mujoco.set_mju_user_warning(lambda message: None)
 
 _NAMES = {
-    "supply.voltage": P_SUPPLY, "motor.resistance": P_RESISTANCE, "motor.inductance": P_INDUCTANCE, "motor.kt": P_KT,
-    "gear.efficiency": P_EFFICIENCY, "encoder.resolution": P_RESOLUTION, "encoder.zero": P_ZERO,
-    "current.offset": P_CURRENT_OFFSET, "command.delay": P_DELAY, "friction.coulomb": _COULOMB,
-    "friction.viscous": _VISCOUS, "hand.fingertip_travel": _TIP,
+    "supply.voltage": P_SUPPLY,
+    "motor.resistance": P_RESISTANCE,
+    "motor.inductance": P_INDUCTANCE,
+    "motor.kt": P_KT,
+    "gear.efficiency": P_EFFICIENCY,
+    "encoder.resolution": P_RESOLUTION,
+    "encoder.zero": P_ZERO,
+    "current.offset": P_CURRENT_OFFSET,
+    "command.delay": P_DELAY,
+    "friction.coulomb": _COULOMB,
+    "friction.viscous": _VISCOUS,
+    "hand.fingertip_travel": _TIP,
 }
 _GROUPS = ("geometry", "inertia", "gravity", "pulleys", "springs", "joints", "carts", "wires")
 _REBUILD = ("motor.armature", "gear.ratio", "pulley.radius")
@@ -258,13 +297,17 @@ class MujocoPlant:
 
     def __init__(self, model: Model, grasp: GraspObject | None = None, *, dt: float = DEFAULT_DT) -> None:
         if not (math.isfinite(dt) and 0.0 < dt <= 5e-4):
-            raise HannesError(f"The integration step is {dt} s; the multi-body plant needs one in (0, 0.0005].")
+            raise HannesError(
+                f"The integration step is {dt} s; the multi-body plant needs one in (0, 0.0005]."
+            )
         self.dt = dt
         self.variant = Variant.of(model.variant)
         self.grasp = grasp
         self._values = model.parameters
-        self._scaled = {name: self._values.value(name) if name in self._values else given
-                        for name, given in _SCALED.items()}
+        self._scaled = {
+            name: self._values.value(name) if name in self._values else given
+            for name, given in _SCALED.items()
+        }
         self.effects = BoundEffects.of(model.effects)
         self.parameters: NDArray[np.float64] = np.zeros(_N_PARAMETERS)
         self.states: NDArray[np.float64] = np.zeros(N_STATE_COMMON)
@@ -273,8 +316,18 @@ class MujocoPlant:
         self._outputs = np.zeros(N_OUTPUTS)
         self._delay = np.zeros(DELAY_RING)
         self.handle: NDArray[np.int64] = np.zeros(_N_HANDLE, dtype=np.int64)
-        self.handle[:N_HANDLE_COMMON] = [a.ctypes.data for a in (
-            self.parameters, self.states, self.reading, self._inputs, self._outputs, self.effects.table, self._delay)]
+        self.handle[:N_HANDLE_COMMON] = [
+            a.ctypes.data
+            for a in (
+                self.parameters,
+                self.states,
+                self.reading,
+                self._inputs,
+                self._outputs,
+                self.effects.table,
+                self._delay,
+            )
+        ]
         self.address: int = _compiled.address
         self._call = _compiled.ctypes
         self._handle_pointer = self.handle.ctypes.data_as(self._call.argtypes[0])
@@ -321,27 +374,49 @@ class MujocoPlant:
             arm = jacobian.get(name, 0.0)
             self._table[_T_J + k] = arm / radius
             self._table[_T_W + k] = arm / radius**2 * travel / JOINT_LIMITS[name].upper
-            self._table[_T_FRICTION + k], self._table[_T_DAMPING + k] = m.dof_frictionloss[dof], m.dof_damping[dof]
+            self._table[_T_FRICTION + k], self._table[_T_DAMPING + k] = (
+                m.dof_frictionloss[dof],
+                m.dof_damping[dof],
+            )
         for k in range(m.npair):
             bodies = m.geom_bodyid[[m.pair_geom1[k], m.pair_geom2[k]]]
             self._table[_T_PAIRS + k] = float(np.sum(m.body_invweight0[bodies, 0]))
 
         spare = self._delay.ctypes.data  # never read or written where the variant lacks the array
-        addresses = [m._address, d._address, _STEP_ADDRESS, self._counts.ctypes.data, d.qpos.ctypes.data,
-                     d.qvel.ctypes.data, d.qfrc_applied.ctypes.data, m.dof_frictionloss.ctypes.data,
-                     m.dof_damping.ctypes.data, m.dof_armature.ctypes.data]
+        addresses = [
+            m._address,
+            d._address,
+            _STEP_ADDRESS,
+            self._counts.ctypes.data,
+            d.qpos.ctypes.data,
+            d.qvel.ctypes.data,
+            d.qfrc_applied.ctypes.data,
+            m.dof_frictionloss.ctypes.data,
+            m.dof_damping.ctypes.data,
+            m.dof_armature.ctypes.data,
+        ]
         wire = m.tendon(MASTER if wires else DRIVE).id
         p[_WIRE_K], p[_WIRE_B] = values.value("wires.master_stiffness"), values.value("wires.damping")
         p[_WIRE_GAIN] = -direct_solref(1.0, 0.0, WIRE_IMPEDANCE, float(m.tendon_invweight0[wire]))[0]
         stretch = m.tendon_solref_lim[wire] if wires else m.eq_solref[m.equality(DRIVE).id]
         addresses += [m.tendon_range[wire].ctypes.data, stretch.ctypes.data]
-        addresses += [m.pair_solref.ctypes.data if m.npair else spare, m.pair_solimp.ctypes.data if m.npair else spare,
-                      d.sensordata.ctypes.data if m.nsensor else spare,
-                      d.warning.number.ctypes.data - 4, self._table.ctypes.data, m.dof_M0.ctypes.data]
+        addresses += [
+            m.pair_solref.ctypes.data if m.npair else spare,
+            m.pair_solimp.ctypes.data if m.npair else spare,
+            d.sensordata.ctypes.data if m.nsensor else spare,
+            d.warning.number.ctypes.data - 4,
+            self._table.ctypes.data,
+            m.dof_M0.ctypes.data,
+        ]
         self.handle[N_HANDLE_COMMON:] = addresses
-        self._given = {"springlength": m.tendon_lengthspring.copy(), "rate": m.tendon_stiffness.copy(),
-                       "springref": m.qpos_spring.copy(), "torsion": m.jnt_stiffness.copy(),
-                       "friction": self._table[_T_FRICTION:_T_DAMPING].copy(), "carts": m.dof_frictionloss.copy()}
+        self._given = {
+            "springlength": m.tendon_lengthspring.copy(),
+            "rate": m.tendon_stiffness.copy(),
+            "springref": m.qpos_spring.copy(),
+            "torsion": m.jnt_stiffness.copy(),
+            "friction": self._table[_T_FRICTION:_T_DAMPING].copy(),
+            "carts": m.dof_frictionloss.copy(),
+        }
         self._scale()
         self._shape_object()
 
@@ -350,7 +425,9 @@ class MujocoPlant:
         m, given = self.model, self._given
         preload, rate, friction = (self._scaled[name] / reference for name, reference in _SCALED.items())
         if rate <= 0.0:
-            raise HannesError(f"hand.stiffness must be above 0, not {self._scaled['hand.stiffness']} N.m/rad.")
+            raise HannesError(
+                f"hand.stiffness must be above 0, not {self._scaled['hand.stiffness']} N.m/rad."
+            )
         # Preload = rate x spring length, so the length takes the preload's factor over the rate's.
         m.tendon_stiffness[:] = given["rate"] * rate
         m.tendon_lengthspring[:] = given["springlength"] * (preload / rate)
@@ -381,8 +458,11 @@ class MujocoPlant:
             m.geom_size[geom, 2] = half
         # The radius of the sphere that holds the geom; collision starts from it.
         sizes = m.geom_size[geom]
-        m.geom_rbound[geom] = {"sphere": half, "capsule": half + sizes[1],
-                               "box": float(np.linalg.norm(sizes))}[self.grasp.shape]
+        m.geom_rbound[geom] = {
+            "sphere": half,
+            "capsule": half + sizes[1],
+            "box": float(np.linalg.norm(sizes)),
+        }[self.grasp.shape]
 
     # -- parameters ---------------------------------------------------------------------------------------------
     @property
@@ -421,7 +501,9 @@ class MujocoPlant:
                 self._values = self._values.with_values({name: value})
                 rebuild = True
             else:
-                raise HannesError(f"The MuJoCo plant has no parameter '{name}'; valid are {', '.join(self.names)}.")
+                raise HannesError(
+                    f"The MuJoCo plant has no parameter '{name}'; valid are {', '.join(self.names)}."
+                )
         if rebuild:
             old = self.data
             self._build()
@@ -435,7 +517,9 @@ class MujocoPlant:
             if name not in JOINT_NAMES:
                 raise HannesError(f"No joint '{name}'; valid are {', '.join(JOINT_NAMES)}.")
             if not (math.isfinite(level) and level >= 0.0):
-                raise HannesError(f"The dry friction of joint '{name}' is {level} N.m; it must be finite, at least 0.")
+                raise HannesError(
+                    f"The dry friction of joint '{name}' is {level} N.m; it must be finite, at least 0."
+                )
             index = JOINT_NAMES.index(name)
             self._table[_T_FRICTION + index] = level
             self.model.dof_frictionloss[self._counts[_C_JOINTS + index]] = level
@@ -490,8 +574,10 @@ class MujocoPlant:
         elif code < 0.0:
             warning = mujoco.mjtWarning(int(-code) - 1).name.removeprefix("mjWARN_")
             reason = f"MuJoCo warns of {warning}, joint '{joint}'"
-        raise PlantDiverged(f"The MuJoCo plant diverged at t = {expected:.4f} s ({reason}); reduce dt or check the "
-                            "parameters' magnitudes.")
+        raise PlantDiverged(
+            f"The MuJoCo plant diverged at t = {expected:.4f} s ({reason}); reduce dt or check the "
+            "parameters' magnitudes."
+        )
 
     def _suspect(self, code: float) -> str:
         """The joint to name: the one that is not finite, else the one that MuJoCo's warning names, else the fastest."""
@@ -512,12 +598,21 @@ class MujocoPlant:
     def tensions(self) -> dict[str, float]:
         """Tension [N] of the three wires at the last step, by name; empty without wires."""
         m, d = self.model, self.data
-        return {m.sensor(k).name.removeprefix("tension_"): float(d.sensordata[m.sensor_adr[k]])
-                for k in range(m.nsensor) if m.sensor(k).name.startswith("tension_")}
+        return {
+            m.sensor(k).name.removeprefix("tension_"): float(d.sensordata[m.sensor_adr[k]])
+            for k in range(m.nsensor)
+            if m.sensor(k).name.startswith("tension_")
+        }
 
 
-def load_curve(model: Model, grasp: GraspObject | None = None, *, speed: float = 1.0, samples: int = 200,
-               dt: float = DEFAULT_DT) -> dict[str, NDArray[np.float64]]:
+def load_curve(
+    model: Model,
+    grasp: GraspObject | None = None,
+    *,
+    speed: float = 1.0,
+    samples: int = 200,
+    dt: float = DEFAULT_DT,
+) -> dict[str, NDArray[np.float64]]:
     """Torque that the hand asks of the pulley, closing and opening slowly: what a reduced plant is derived from.
 
     The motor's own friction is off: the pulley is led by a stiff spring and damper along the ramp
@@ -542,7 +637,9 @@ def load_curve(model: Model, grasp: GraspObject | None = None, *, speed: float =
         torque, at = np.empty(steps), np.empty(steps)
         for k in range(steps):
             target = travel * (k / steps if direction > 0 else 1.0 - k / steps) * radius
-            force = stiffness * (target - d.qpos[motor]) + damping * (direction * speed * radius - d.qvel[motor])
+            force = stiffness * (target - d.qpos[motor]) + damping * (
+                direction * speed * radius - d.qvel[motor]
+            )
             d.qfrc_applied[motor] = force
             mujoco.mj_step(m, d)
             torque[k], at[k] = force * radius, d.qpos[motor] / radius
@@ -559,6 +656,15 @@ def load_curve(model: Model, grasp: GraspObject | None = None, *, speed: float =
 def describe(plant: MujocoPlant) -> dict[str, Any]:
     """Sizes of the compiled model, for benchmarks and reports."""
     m = plant.model
-    return {"nv": m.nv, "nbody": m.nbody, "ntendon": m.ntendon, "npair": m.npair, "dt": plant.dt,
-            "variant": {"return_mechanism": plant.variant.return_mechanism, "transmission": plant.variant.transmission,
-                        "thumb_stop_deg": plant.variant.thumb_stop_deg}}
+    return {
+        "nv": m.nv,
+        "nbody": m.nbody,
+        "ntendon": m.ntendon,
+        "npair": m.npair,
+        "dt": plant.dt,
+        "variant": {
+            "return_mechanism": plant.variant.return_mechanism,
+            "transmission": plant.variant.transmission,
+            "thumb_stop_deg": plant.variant.thumb_stop_deg,
+        },
+    }

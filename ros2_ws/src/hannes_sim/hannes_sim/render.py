@@ -29,8 +29,12 @@ Image = NDArray[np.uint8]
 OPEN: NDArray[np.float64] = np.zeros(len(JOINT_NAMES))
 """Joint positions (13,) of the open hand."""
 
-CLOSED: NDArray[np.float64] = np.array([0.0 if name.endswith("_abd") and not name.startswith("thumb")
-                                        else JOINT_LIMITS[name].upper for name in JOINT_NAMES])
+CLOSED: NDArray[np.float64] = np.array(
+    [
+        0.0 if name.endswith("_abd") and not name.startswith("thumb") else JOINT_LIMITS[name].upper
+        for name in JOINT_NAMES
+    ]
+)
 """Joint positions (13,) of the closed hand."""
 
 VIEWS: Mapping[str, tuple[float, float, float, tuple[float, float, float]]] = {
@@ -60,8 +64,15 @@ class HandRenderer:
     width, height  pixels
     """
 
-    def __init__(self, parameters: ParameterSet, variant: Variant | Mapping[str, object] | None = None,
-                 grasp: GraspObject | None = None, *, width: int = 800, height: int = 800) -> None:
+    def __init__(
+        self,
+        parameters: ParameterSet,
+        variant: Variant | Mapping[str, object] | None = None,
+        grasp: GraspObject | None = None,
+        *,
+        width: int = 800,
+        height: int = 800,
+    ) -> None:
         spec = build_spec(parameters, variant, grasp)
         spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
         spec.visual.quality.offsamples = 4
@@ -70,14 +81,27 @@ class HandRenderer:
         spec.visual.headlight.diffuse = [0.38, 0.38, 0.38]
         spec.visual.headlight.specular = [0.25, 0.25, 0.25]
         spec.visual.map.znear, spec.visual.map.zfar = 0.02, 30.0
-        spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384,
-                         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=[0.97, 0.975, 0.98],
-                         rgb2=[0.80, 0.83, 0.87])
-        for place, direction, strength in (((0.4, 0.5, 0.6), (-0.5, -0.6, -0.7), 0.55),
-                                           ((0.5, -0.4, 0.2), (-0.7, 0.6, -0.2), 0.25)):
-            spec.worldbody.add_light(pos=list(place), dir=list(direction), diffuse=[strength] * 3,
-                                     specular=[0.4 * strength] * 3, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-                                     castshadow=strength > 0.5)
+        spec.add_texture(
+            name="sky",
+            type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+            width=64,
+            height=384,
+            builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+            rgb1=[0.97, 0.975, 0.98],
+            rgb2=[0.80, 0.83, 0.87],
+        )
+        for place, direction, strength in (
+            ((0.4, 0.5, 0.6), (-0.5, -0.6, -0.7), 0.55),
+            ((0.5, -0.4, 0.2), (-0.7, 0.6, -0.2), 0.25),
+        ):
+            spec.worldbody.add_light(
+                pos=list(place),
+                dir=list(direction),
+                diffuse=[strength] * 3,
+                specular=[0.4 * strength] * 3,
+                type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+                castshadow=strength > 0.5,
+            )
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self._addresses = [int(self.model.joint(name).qposadr[0]) for name in JOINT_NAMES]
@@ -89,8 +113,10 @@ class HandRenderer:
             self._canvas = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except Exception as error:  # the OpenGL back ends raise types of their own
             self.close()
-            raise HannesError(f"No offscreen OpenGL for pictures ({type(error).__name__}: {error}); install libegl1 or "
-                              "set MUJOCO_GL=osmesa.") from error
+            raise HannesError(
+                f"No offscreen OpenGL for pictures ({type(error).__name__}: {error}); install libegl1 or "
+                "set MUJOCO_GL=osmesa."
+            ) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._canvas)
         self._scene = mujoco.MjvScene(self.model, maxgeom=500)
         self._size = mujoco.MjrRect(0, 0, width, height)
@@ -104,8 +130,10 @@ class HandRenderer:
             raise HannesError(f"Unknown view '{view}'; valid are {', '.join(VIEWS)}.")
         positions = np.asarray(joint_positions, dtype=np.float64)
         if positions.shape != (len(JOINT_NAMES),) or not np.all(np.isfinite(positions)):
-            raise HannesError(f"A picture needs {len(JOINT_NAMES)} finite joint positions, not an array of shape "
-                              f"{positions.shape}.")
+            raise HannesError(
+                f"A picture needs {len(JOINT_NAMES)} finite joint positions, not an array of shape "
+                f"{positions.shape}."
+            )
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._addresses] = positions
         mujoco.mj_forward(self.model, self.data)
@@ -116,8 +144,9 @@ class HandRenderer:
         camera.lookat[:] = lookat
         image = np.empty((self._size.height, self._size.width, 3), dtype=np.uint8)
         self._context.make_current()  # another renderer may have drawn since
-        mujoco.mjv_updateScene(self.model, self.data, self._options, None, camera,
-                               mujoco.mjtCatBit.mjCAT_ALL.value, self._scene)
+        mujoco.mjv_updateScene(
+            self.model, self.data, self._options, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
+        )
         mujoco.mjr_render(self._size, self._scene, self._canvas)
         mujoco.mjr_readPixels(image, None, self._size, self._canvas)
         return np.flipud(image).copy()
@@ -151,11 +180,17 @@ def save_png(image: Image, path: str | Path) -> Path:
     height, width = image.shape[:2]
 
     def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        return (
+            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        )
 
     rows = np.concatenate([np.zeros((height, 1), dtype=np.uint8), image.reshape(height, 3 * width)], axis=1)
-    content = (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
-               + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6)) + chunk(b"IEND", b""))
+    content = (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+        + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6))
+        + chunk(b"IEND", b"")
+    )
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

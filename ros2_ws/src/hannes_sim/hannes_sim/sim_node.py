@@ -34,23 +34,42 @@ class HandSimParameters:
     """ROS parameters of hand_sim."""
 
     model: str = parameter("nominal", "model: name of a shipped one or path of a model file")
-    plant: str = parameter("", "plant instead of the model's: reduced, mujoco or path.py:Class; empty for the model's")
+    plant: str = parameter(
+        "", "plant instead of the model's: reduced, mujoco or path.py:Class; empty for the model's"
+    )
     object: str = parameter("none", "object to grasp", choices=("none", "soft", "rigid"))
-    object_size: float = parameter(0.0, "size instead of the object's, 0 for its own", lower=0.0, upper=0.2, unit="m")
-    object_stiffness: float = parameter(0.0, "contact stiffness of a fingertip instead of the object's, 0 for its own",
-                                        lower=0.0, upper=1e7, unit="N/m")
+    object_size: float = parameter(
+        0.0, "size instead of the object's, 0 for its own", lower=0.0, upper=0.2, unit="m"
+    )
+    object_stiffness: float = parameter(
+        0.0,
+        "contact stiffness of a fingertip instead of the object's, 0 for its own",
+        lower=0.0,
+        upper=1e7,
+        unit="N/m",
+    )
     clock: str = parameter("realtime", CLOCK_HELP, choices=CLOCKS)
     period: float = parameter(1e-3, "control period", lower=1e-4, upper=1e-1, unit="s")
-    command_timeout_ms: float = parameter(80.0, "0 V this long after the last command (realtime); in lockstep the "
-                                          "wait for a command after which it is reported", lower=1.0, upper=1e4,
-                                          unit="ms")
-    duration: float = parameter(0.0, "simulated time after which the node ends, 0 for never", lower=0.0, upper=1e6,
-                                unit="s")
-    joint_states_rate: float = parameter(100.0, "rate of joint_states and grip_force", lower=1.0, upper=1e4, unit="Hz")
-    subscribers: int = parameter(1, "subscribers that motor/state must have before the first tick of lockstep",
-                                 lower=1, upper=100)
-    current_noise: float = parameter(0.0, "standard deviation of noise on the measured current", lower=0.0, upper=1.0,
-                                     unit="A")
+    command_timeout_ms: float = parameter(
+        80.0,
+        "0 V this long after the last command (realtime); in lockstep the "
+        "wait for a command after which it is reported",
+        lower=1.0,
+        upper=1e4,
+        unit="ms",
+    )
+    duration: float = parameter(
+        0.0, "simulated time after which the node ends, 0 for never", lower=0.0, upper=1e6, unit="s"
+    )
+    joint_states_rate: float = parameter(
+        100.0, "rate of joint_states and grip_force", lower=1.0, upper=1e4, unit="Hz"
+    )
+    subscribers: int = parameter(
+        1, "subscribers that motor/state must have before the first tick of lockstep", lower=1, upper=100
+    )
+    current_noise: float = parameter(
+        0.0, "standard deviation of noise on the measured current", lower=0.0, upper=1.0, unit="A"
+    )
     seed: int = parameter(0, "seed of the noise", lower=0, upper=2**31)
 
     def grasp(self) -> GraspObject | None:
@@ -58,11 +77,13 @@ class HandSimParameters:
         named = named_object(self.object)
         if named is None:
             if self.object_size or self.object_stiffness:
-                raise HannesError("Parameters object_size and object_stiffness need an object; set object to soft or "
-                                  "rigid.")
+                raise HannesError(
+                    "Parameters object_size and object_stiffness need an object; set object to soft or rigid."
+                )
             return None
-        return replace(named, size=self.object_size or named.size,
-                       stiffness=self.object_stiffness or named.stiffness)
+        return replace(
+            named, size=self.object_size or named.size, stiffness=self.object_stiffness or named.stiffness
+        )
 
 
 class HandSim(HannesNode, Node):
@@ -101,10 +122,16 @@ class HandSim(HannesNode, Node):
         self._clock_heard = False
         on_voltage = self._on_tick_voltage if self._lockstep else self._on_voltage
         self._voltage = topics.subscription(self, "motor_voltage", on_voltage)
-        self._peers = Peers({
-            "a publisher of motor/voltage": (self._voltage_publishers, 1),
-            f"{p.subscribers} subscriber(s) of motor/state": (self._state.get_subscription_count, p.subscribers),
-            "a subscriber of motor/current": (self._current.get_subscription_count, 1)})
+        self._peers = Peers(
+            {
+                "a publisher of motor/voltage": (self._voltage_publishers, 1),
+                f"{p.subscribers} subscriber(s) of motor/state": (
+                    self._state.get_subscription_count,
+                    p.subscribers,
+                ),
+                "a subscriber of motor/current": (self._current.get_subscription_count, 1),
+            }
+        )
         self._reported: list[str] = []
         self._diagnostics = Diagnostics(self, self._health, self._status)
         self._loop = RealtimeLoop(p.period, self._step)
@@ -114,8 +141,9 @@ class HandSim(HannesNode, Node):
         else:
             self._loop.start()
         held = "nothing" if p.object == "none" else f"a {p.object} object"
-        self.get_logger().info(f"model {model.name}, plant {model.plant}, holding {held}, {p.clock}, "
-                               f"{1 / p.period:g} Hz")
+        self.get_logger().info(
+            f"model {model.name}, plant {model.plant}, holding {held}, {p.clock}, {1 / p.period:g} Hz"
+        )
 
     def stop(self) -> None:
         """End the real-time loop."""
@@ -134,8 +162,11 @@ class HandSim(HannesNode, Node):
         self._state.publish(state)  # first: most of the graph waits for it
         self._current.publish(self._last[1])
         if self._tick % self._slow_every == 0:
-            self._joints.publish(convert.FINGER_STATES.encode(stamp_ns, reading.joint_positions.tolist(),
-                                                              reading.joint_velocities.tolist()))
+            self._joints.publish(
+                convert.FINGER_STATES.encode(
+                    stamp_ns, reading.joint_positions.tolist(), reading.joint_velocities.tolist()
+                )
+            )
             self._force.publish(convert.float64_bytes(reading.grip_force))
         self._health.cycles += 1
 
@@ -149,8 +180,10 @@ class HandSim(HannesNode, Node):
         self._tick += periods
         if self._tick >= self._ticks:
             elapsed = max(monotonic() - self._began, 1e-9)
-            self.get_logger().info(f"finished {self._tick * self._p.period:g} s in {elapsed:.2f} s "
-                                   f"({self._tick * self._p.period / elapsed:.1f} x real time)")
+            self.get_logger().info(
+                f"finished {self._tick * self._p.period:g} s in {elapsed:.2f} s "
+                f"({self._tick * self._p.period / elapsed:.1f} x real time)"
+            )
             self.done = True
             return False
         return True
@@ -160,9 +193,13 @@ class HandSim(HannesNode, Node):
         self._health.last_input = gate.last_command
         age = "" if gate.age_at_zero is None else f"{gate.age_at_zero:.4f}"
         values: dict[str, object] = {
-            "tick": self._tick, "stalls": self._watch.stalls,
-            "rejected_commands": gate.rejected, "clamped_commands": gate.clamped, "command_timeouts": gate.timeouts,
-            "command_age_at_zero_s": age}
+            "tick": self._tick,
+            "stalls": self._watch.stalls,
+            "rejected_commands": gate.rejected,
+            "clamped_commands": gate.clamped,
+            "command_timeouts": gate.timeouts,
+            "command_age_at_zero_s": age,
+        }
         if (drivers := self._voltage_publishers()) > 1:
             return ERROR, f"{drivers} publishers of motor/voltage; only one may drive the motor", values
         if not self._lockstep:
@@ -185,8 +222,9 @@ class HandSim(HannesNode, Node):
         """One period of the real-time thread; periods that were missed are made up for, within reason."""
         self._began = self._began or now
         self._applied = self._gate.voltage(now)
-        if not self.done and self._advance(self._applied,
-                                           min(elapsed, max(1, round(_LONGEST_CATCH_UP_S / self._p.period)))):
+        if not self.done and self._advance(
+            self._applied, min(elapsed, max(1, round(_LONGEST_CATCH_UP_S / self._p.period)))
+        ):
             self._publish(self.get_clock().now().nanoseconds)
 
     def _check_realtime(self) -> None:

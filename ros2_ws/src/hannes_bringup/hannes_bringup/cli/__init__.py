@@ -35,7 +35,11 @@ class Command:
 
 
 COMMANDS: tuple[Command, ...] = (
-    Command("demo", "hannes_bringup.cli.demo:demo", "The whole way once: graph, bags, comparison, diagnosis, report."),
+    Command(
+        "demo",
+        "hannes_bringup.cli.demo:demo",
+        "The whole way once: graph, bags, comparison, diagnosis, report.",
+    ),
     Command("run", "hannes_bringup.cli.run:app", "Start the whole node graph, or one node."),
     Command("nodes", "hannes_bringup.cli.nodes:nodes", "Show what is running: nodes, topics, rates, ages."),
     Command("motor", "hannes_bringup.cli.motor:motor", "Switch the motor of a running hand on or off."),
@@ -45,11 +49,17 @@ COMMANDS: tuple[Command, ...] = (
     Command("play", "hannes_bringup.cli.bags:play", "Play a bag back onto the topics, with /clock."),
     Command("info", "hannes_bags.cli:info", "Show what a bag holds, and that it is intact."),
     Command("recover", "hannes_bringup.cli.bags:recover", "Save what is left of a cut or damaged bag."),
-    Command("compare", "hannes_lab.cli:compare", "Compare the model with recorded closures: where does it fail?"),
+    Command(
+        "compare", "hannes_lab.cli:compare", "Compare the model with recorded closures: where does it fail?"
+    ),
     Command("diagnose", "hannes_lab.cli:diagnose", "Which physical effect does the model lack?"),
     Command("add", "hannes_lab.cli:add", "Add effects to the model, fit them, show the error fall."),
-    Command("calibrate", "hannes_lab.calibrate:command", "Identify named parameters of your hand from its bags."),
-    Command("validate", "hannes_lab.validation.cli:validate", "Hold the model against the thesis, row by row."),
+    Command(
+        "calibrate", "hannes_lab.calibrate:command", "Identify named parameters of your hand from its bags."
+    ),
+    Command(
+        "validate", "hannes_lab.validation.cli:validate", "Hold the model against the thesis, row by row."
+    ),
     Command("hide", "hannes_lab.cli:hide", "Make a measurement set with a hidden effect."),
     Command("report", "hannes_lab.cli:report", "Compare, diagnose and add, on one HTML page."),
     Command("page", "hannes_lab.page:page", "Compare, diagnose and add, in a web page of this machine."),

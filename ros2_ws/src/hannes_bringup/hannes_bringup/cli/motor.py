@@ -21,7 +21,9 @@ class Wanted(StrEnum):
 def motor(
     wanted: Annotated[Wanted | None, typer.Argument(help="on or off; without it the state is shown.")] = None,
     node: Annotated[str, typer.Option(help="Name of the lifecycle node.")] = "/hannes/motor_controller",
-    timeout: Annotated[float, typer.Option(min=0.5, max=60.0, help="How long to look for it, in seconds.")] = 5.0,
+    timeout: Annotated[
+        float, typer.Option(min=0.5, max=60.0, help="How long to look for it, in seconds.")
+    ] = 5.0,
     json: JsonOption = False,
 ) -> None:
     """Show, or switch, whether a controller drives the motor; also after a pause has switched it off.

@@ -23,7 +23,9 @@ class VelocityStrengthening(Effect):
             "velocity", "rad/s", 0.05, 2.0, 0.5, None, "speed v_w at which it comes", starts=(0.2, 1.0)
         ),
     )
-    looks_like = "the start and the turn are softer than dry friction makes them; no jump of the current at rest"
+    looks_like = (
+        "the start and the turn are softer than dry friction makes them; no jump of the current at rest"
+    )
     told_by = "slow reversals: several starts from rest"
 
     @staticmethod
