@@ -28,7 +28,8 @@ test: setup ## all tests
 	@$(BIN)/python -m pytest $(PYTEST_FLAGS) $(TESTS)
 
 check: setup ## ruff (rules and layout) and mypy
-	@status=0; $(BIN)/ruff check . || status=1; $(BIN)/ruff format --check --quiet . || status=1; $(BIN)/mypy --config-file pyproject.toml || status=1; exit $$status
+	@status=0; $(BIN)/ruff check . || status=1; $(BIN)/ruff format --check --quiet . || status=1; $(BIN)/mypy --config-file pyproject.toml || status=1; \
+	$(BIN)/mypy --config-file pyproject.toml bench tools || status=1; exit $$status
 
 bench: setup ## speed and identification benchmarks, as ratios in one run
 	@for file in bench/*.py; do echo "== $$file"; $(BIN)/python $$file || exit 1; done

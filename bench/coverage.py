@@ -35,7 +35,7 @@ def main() -> None:
             prepare(unique_names([make_trial(r) for r in recordings]), nominal), names, starts=1
         )
         explained = found.errors["after"] <= LARGE_MISFIT
-        text = []
+        text: list[str] = []
         for p in found.parameters:
             true = nominal.parameters.value(p.name) * float(truth.parameters[p.name].split()[1])
             exact = 0.5 * math.log(p.high / p.low) * math.sqrt(max(0.0, 1.0 - p.held_share))

@@ -85,7 +85,7 @@ def in_process(plant: str, seconds: float) -> float:
 
 def graph(kind: str, names: tuple[str, ...], plant: str, seconds: float) -> Result:
     """Run hand_sim and its peers for `seconds` of simulated time."""
-    own = {
+    own: dict[str, dict[str, object]] = {
         "hand_sim": {"duration": seconds, "plant": plant, "subscribers": len(names) - 1},
         "motor_controller": (
             {} if "emg_reference" in names else {"reference": "half_sine", "reference_closures": 100}

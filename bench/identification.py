@@ -234,10 +234,10 @@ def cases(kinds: list[str], limits: dict[str, float], quick: bool, first: int = 
         ):
             out.append(Case("logging", (one,), 1.0, first + 50_000 + k, sensors=sensors, signals=signals))
     if "mismatch" in kinds:
-        chosen: list[tuple[Any, ...]] = [(), *((t,) for t in typical if t[0] in LOGGED[:4])]
+        hidden: list[tuple[Any, ...]] = [(), *((t,) for t in typical if t[0] in LOGGED[:4])]
         out += [
             Case("mismatch", effects, 1.0, first + 60_000 + k, made_by="nominal_mujoco")
-            for k, effects in enumerate(chosen)
+            for k, effects in enumerate(hidden)
         ]
     return out
 

@@ -176,11 +176,11 @@ def errors(wide: Sequence[Answered], ten: Sequence[Answered], model: Model, seed
     rows = []
     for effect in ["none", *sorted({n for some in names.values() for n in some})]:
         hands = {h for h, some in names.items() if (effect in some or (effect == "none" and not some))}
-        here = [a for a in ten if a.closure.scene.hand in hands]
-        y = samples(here)
+        closures = [a for a in ten if a.closure.scene.hand in hands]
+        y = samples(closures)
         rows.append(
             [effect.replace("_", " "), str(len(hands)), percent(float(np.mean(y[:, 3] != y[:, 4]))),
-             f"{sum(a.kind != a.grasp for a in here)} of {len(here)}"]
+             f"{sum(a.kind != a.grasp for a in closures)} of {len(closures)}"]
         )  # fmt: skip
     rows.sort(key=lambda row: -float(row[2].split()[0]))
     return by_sample, table(("hidden effect", "hands", "samples wrong", "grasps wrong"), rows)

@@ -33,7 +33,8 @@ def renewed(text: str) -> str:
     """The text with every table made afresh."""
     for name, make in TABLES.items():
         pattern = rf"(<!-- table: {name} -->\n).*?(<!-- end -->)"
-        text, count = re.subn(pattern, lambda m, make=make: f"{m[1]}{make()}\n{m[2]}", text, flags=re.DOTALL)
+        table = make().replace("\\", r"\\")
+        text, count = re.subn(pattern, rf"\g<1>{table}\n\g<2>", text, flags=re.DOTALL)
         if count != 1:
             raise SystemExit(f"README.md has {count} tables named {name}; it must have one.")
     return text

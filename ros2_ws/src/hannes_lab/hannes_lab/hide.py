@@ -72,7 +72,8 @@ class Truth:
     """What was hidden: the effects, the hand's own parameters, and the seed."""
 
     effects: tuple[EffectEntry, ...]
-    parameters: Mapping[str, float]
+    parameters: Mapping[str, str]
+    """the hand's own beside the nominal: 'x 1.0421' or '+ 0.0031 rad'"""
     seed: int
     plant: str
 
@@ -131,7 +132,7 @@ def make_set(
         name: (f"x {math.exp(z):.4f}" if table[name]["unit"] == "1" else f"+ {z:.4f} {table[name]['unit']}")
         for name, z in hand.items()
     }
-    return recordings, Truth(tuple(effects), truth, seed, model.plant)  # type: ignore[arg-type]
+    return recordings, Truth(tuple(effects), truth, seed, model.plant)
 
 
 def _record(
