@@ -185,6 +185,17 @@ def test_a_recording_that_ends_soon_after_the_move_shortens_the_closures_and_is_
     assert f"the first {lengths[0]:.2f} s" in joined.notes[-1] and "ends early" in joined.notes[-1]
 
 
+def test_a_note_about_some_of_the_joined_recordings_says_which(whole: list[Recording]) -> None:
+    parts = [
+        replace(one, trial=replace(one.trial, source=f"run_{k}", notes=notes))
+        for k, (one, notes) in enumerate(
+            zip(loaded(cut(whole[0])[:3]), [("all", "some"), ("all",), ("all", "some")], strict=True)
+        )
+    ]
+    (joined,) = join_repeats(parts)
+    assert joined.notes[:2] == ("all", "run_0, run_2: some") and len(joined.notes) == 3
+
+
 def test_a_bag_without_a_whole_closure_or_given_twice_is_left_out_with_a_note(
     whole: list[Recording], tmp_path: Path
 ) -> None:

@@ -199,13 +199,19 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
         reference=reference,
         signals=signals,
         closures=tuple(replace(c, number=ordinals[c.start]) for c in closures),
-        notes=(
-            *dict.fromkeys(n for t in trials for n in t.notes),
-            said,
-        ),
+        notes=(*_notes(trials, names), said),
         parts=tuple(
             Part(name, t.source, t.sha256, float(begin))
             for name, t, begin in zip(names, trials, begins, strict=True)
         ),
         fresh=fresh,
     )
+
+
+def _notes(trials: Sequence[Trial], names: Sequence[str]) -> list[str]:
+    """Every note once, with the recordings that it is about where these are not all."""
+    about: dict[str, list[str]] = {}
+    for name, trial in zip(names, trials, strict=True):
+        for note in trial.notes:
+            about.setdefault(note, []).append(name)
+    return [n if len(of) == len(trials) else f"{', '.join(of)}: {n}" for n, of in about.items()]
