@@ -248,6 +248,7 @@ def run_case(case: Case) -> dict[str, Any]:
         "tied": [sorted(t) for t in found.tied],
         "falls": [[f.added, f.held_out, dict(f.by_condition)] for f in found.falls],
         "costs": dict(found.costs),
+        "prior_sds": {name: row["prior_sds"] for name, row in found.nuisances.items()},
         "seconds": time.monotonic() - start,
     }
 

@@ -29,6 +29,7 @@ from .compare import compare as compare_model
 from .diagnose import MAX_EFFECTS, Diagnosis, effect_sources
 from .diagnose import diagnose as diagnose_model
 from .executor import Executor, interruptible
+from .experiments import VISIBLE, Experiment
 from .own_effect import check_own_effects
 from .prepare import Prepared, load_trials, prepare
 from .rig import load_rig
@@ -360,11 +361,7 @@ def _show_diagnosis(found: Diagnosis) -> None:
         console.print("\nRanking (part of the excess misfit that each effect explains alone):")
         for rank in found.ranking[:8]:
             console.print(f"  {100 * rank.explained:5.1f} %  {' + '.join(rank.names)}")
-    for experiment in found.experiments:
-        console.print(
-            f"\nTo tell apart {', '.join(' + '.join(n) for n in experiment.separates)}: {experiment.name} "
-            f"(distance {_number(experiment.distance, 3)})\n  {experiment.to_dict()['command']}"
-        )
+    _show_experiments(console, found.experiments)
     if found.verdict == "unknown":
         console.print(
             "\nThe rest depends on: "
@@ -372,6 +369,15 @@ def _show_diagnosis(found: Diagnosis) -> None:
         )
     for note in found.notes:
         console.print(f"note: {note}", style="dim")
+
+
+def _show_experiments(console: Console, experiments: Sequence[Experiment]) -> None:
+    for experiment in (e for e in experiments if e.distance >= VISIBLE):
+        tied = ", ".join(" + ".join(names) for names in experiment.separates)
+        console.print(
+            f"\nTo tell apart {tied}: {experiment.name} (they differ by {_number(experiment.distance, 3)} standard "
+            f"deviations of the noise there)\n  {experiment.to_dict()['command']}"
+        )
 
 
 def _show_falls(console: Console, found: Diagnosis | Addition) -> None:

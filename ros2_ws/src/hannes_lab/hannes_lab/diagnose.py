@@ -23,7 +23,7 @@ from .errors import (
     signal_errors,
 )
 from .executor import Executor
-from .experiments import Experiment, separating_experiments
+from .experiments import VISIBLE, Experiment, separating_experiments
 from .features import Features, data_used
 from .fit import Fit
 from .greedy import grow
@@ -304,7 +304,13 @@ def diagnose(
         chance=limits,
         costs={"nominal_fitted": null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
         nuisances=_nuisance_table(best.fit),
-        notes=(*prepared.notes, *choice.notes, *_identifiability_notes(best), *_failed(search.problem)),
+        notes=(
+            *prepared.notes,
+            *choice.notes,
+            *_inseparable(search, experiments),
+            *_identifiability_notes(best),
+            *_failed(search.problem),
+        ),
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
         model=model,
@@ -373,7 +379,7 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         # What chance gains was found for effects of one free strength; further parameters pay their penalty.
         gain = choice.best.penalised + PENALTY - round_[0].penalised
         # Within chance there is nothing to explain, unless an effect gains more than chance does.
-        whole = round_[0].fit.cost if enough and gain >= needed else limits.median
+        whole = min(round_[0].fit.cost, limits.median) if gain >= needed else limits.median
         ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, whole)) for c in round_)
         if gain < needed:
             choice = replace(choice, ranking=ranking)
@@ -651,6 +657,19 @@ def _failed(problem: Problem) -> list[str]:
         return []
     return [
         f"{problem.failures} of {problem.simulations} simulations did not stay finite and counted as very bad fits"
+    ]
+
+
+def _inseparable(search: Search, experiments: Sequence[Experiment]) -> list[str]:
+    """What shows each of the tied effects, where no experiment that was considered tells them apart."""
+    if not experiments or experiments[0].distance >= VISIBLE:
+        return []
+    names = dict.fromkeys(name for tied in experiments[0].separates for name in tied)
+    shown = "; ".join(f"{name} by: {search.effect(name).told_by or '(not said)'}" for name in names)
+    return [
+        f"no further recording that was considered tells {', '.join(' + '.join(t) for t in experiments[0].separates)} "
+        f"apart (they differ by {experiments[0].distance:.1f} standard deviations of the noise at most); what shows "
+        f"each: {shown}"
     ]
 
 

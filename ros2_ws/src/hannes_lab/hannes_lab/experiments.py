@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,17 @@ from hannes_control.reference import make_profile
 from numpy.typing import NDArray
 
 from .prepare import Prepared
+from .problem import Coordinate, nuisance_coordinate
+from .rig import Rig
 from .search import Candidate, Search
 from .surrogate import FAST_PLANT, SLOW_PLANTS
 from .trials import Trial
 
 Array = NDArray[np.float64]
+
+
+VISIBLE = 3.0
+"""Whitened distance from which two models can be told apart by an experiment."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +83,10 @@ def separating_experiments(
     out = []
     for name, profile, options, grasp in CANDIDATES:
         trial = _trial(prepared.features.trials[0], name, profile, options, grasp)
-        predictions = [_predict(prepared, c, trial, noise) for c in tied]
-        sensitivity = _sensitivity(prepared, tied[0], trial, noise, predictions[0])
+        rig = type(prepared.rig)([trial])  # type: ignore[call-arg]
+        open_ = [_open(rig, c) for c in tied]
+        predictions = [_predict(rig, c, trial, noise, o) for c, o in zip(tied, open_, strict=True)]
+        sensitivity = _sensitivity(rig, tied[0], trial, noise, open_[0], predictions[0])
         distances = []
         for a, b in itertools.combinations(range(len(tied)), 2):
             d = predictions[a] - predictions[b]
@@ -108,36 +116,57 @@ def _trial(like: Trial, name: str, profile: str, options: dict[str, float], gras
     return Trial(name, like.period, reference, like.signals, like.closures, meta)
 
 
+def _open(rig: Rig, candidate: Candidate) -> list[tuple[Coordinate, float]]:
+    """What stays open in a new recording, as coordinates with their z: the hand's fitted parameters, and its own.
+
+    Those of the recording (the encoder's zero, clocks) begin at the mean of what was fitted to the others; those of
+    its object are of that object.
+    """
+    fit = candidate.fit
+    out = [
+        (c, float(z)) for c, z in zip(fit.coordinates, fit.z, strict=True) if c.prior and "@" not in c.name
+    ]
+    for nuisance in rig.nuisances(fit.model):
+        family, its_own, _ = nuisance.name.partition("@")
+        if its_own:
+            fitted = [v for name, v in fit.values.items() if name.startswith(f"{family}@")]
+            if fitted and not family.startswith("object."):
+                nuisance = replace(nuisance, mean=float(np.mean(fitted)))
+            out.append((nuisance_coordinate(nuisance), 0.0))
+    return out
+
+
 def _predict(
-    prepared: Prepared,
+    rig: Rig,
     candidate: Candidate,
     trial: Trial,
     noise: dict[str, float],
-    values: dict[str, float] | None = None,
+    open_: Sequence[tuple[Coordinate, float]],
 ) -> Array:
-    rig = type(prepared.rig)([trial])  # type: ignore[call-arg]
+    model = candidate.fit.model
+    values = {n: v for n, v in candidate.fit.values.items() if "@" not in n}
     run = rig.simulate(
-        candidate.fit.model.with_plant(FAST_PLANT)
-        if candidate.fit.model.plant in SLOW_PLANTS
-        else candidate.fit.model,
-        {n: v for n, v in (values or candidate.fit.values).items() if "@" not in n},
+        model.with_plant(FAST_PLANT) if model.plant in SLOW_PLANTS else model,
+        values | {c.name: c.value(z) for c, z in open_},
         trial,
         trial.reference,
     )
     every = max(1, round(1.0 / 30.0 / trial.period))
-    second = (
-        trial.reference.size // 2
-    )  # the first closure starts from rest at encoder zero and tells of that alone
+    # the first closure starts from rest at encoder zero and tells of that alone
+    second = trial.reference.size // 2
     return np.concatenate([run[signal][second::every] / sd for signal, sd in noise.items()])
 
 
 def _sensitivity(
-    prepared: Prepared, candidate: Candidate, trial: Trial, noise: dict[str, float], base: Array
+    rig: Rig,
+    candidate: Candidate,
+    trial: Trial,
+    noise: dict[str, float],
+    open_: Sequence[tuple[Coordinate, float]],
+    base: Array,
 ) -> Array:
     columns = []
-    for c in candidate.fit.coordinates:
-        if c.prior and "@" not in c.name:
-            z = candidate.fit.z_of(c.name) or 0.0
-            moved = {**candidate.fit.values, c.name: c.value(z + c.step)}
-            columns.append((_predict(prepared, candidate, trial, noise, moved) - base) / c.step)
+    for k, (c, z) in enumerate(open_):
+        moved = [*open_[:k], (c, z + c.step), *open_[k + 1 :]]
+        columns.append((_predict(rig, candidate, trial, noise, moved) - base) / c.step)
     return np.column_stack(columns) if columns else np.zeros((base.size, 0))

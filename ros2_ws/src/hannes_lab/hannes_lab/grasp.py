@@ -38,6 +38,11 @@ RISE = (0.3, 0.8)
 """Parts of the excess between which its slope is taken."""
 
 
+OWN_RISE = 0.5
+"""Part of the excess that must come from the recording's own rising current: a fast hand that brakes needs less current
+than a slow one at the same place, and nothing was grasped."""
+
+
 def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
     """The trials, with an object of roughly seen stiffness and place where nobody said what was grasped.
 
@@ -155,7 +160,10 @@ def _seen(
     excess = np.maximum.accumulate(np.maximum(current - base, 0.0)[: peak + 1])
     first, last = (int(np.searchsorted(excess, part * excess[-1])) for part in RISE)
     run = max(float(q[last] - q[first]), 1e-3)
-    slope = max(float(excess[last] - excess[first]), 1e-6) / run
+    rise = float(excess[last] - excess[first])
+    if current[last] - current[first] < OWN_RISE * rise:
+        return None
+    slope = max(rise, 1e-6) / run
     place = float(q[first]) - float(excess[first]) / slope
     if slope * per_ampere < STIFFER * rate or place < FREE_TRAVEL * q[-1]:
         return None

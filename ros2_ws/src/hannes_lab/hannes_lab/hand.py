@@ -300,35 +300,45 @@ def outer_loop(trials: Sequence[Trial]) -> tuple[float, float, float] | None:
 
     While the inner loop keeps up, i = kp (r - tau r' - q) - kd q', whatever the motor drives; so r - q is linear in
     i, q' and r'.  A negative tau is a controller that sees the reference's rate too (a derivative of the error).
+    Taken from the recording in which this holds best: in fast ones the voltage reaches its limit, and a logger of few
+    hertz that averages and rectifies lags behind the current.
     None where the recordings do not show it.
     """
+    found = [law for law in map(_outer_law, trials) if law is not None]
+    return min(found)[1] if found else None
+
+
+def _outer_law(trial: Trial) -> tuple[float, tuple[float, float, float]] | None:
+    """Part of r - q that the law of `outer_loop` leaves in one recording, and its gain, damping and delay."""
+    if not {"motor_current", "encoder_position"} <= set(trial.signals):
+        return None
+    time, current = trial.signals["motor_current"]
+    signed = float(current.min()) < -0.05 * float(current.max())
+    ticks = np.arange(trial.reference.size) * trial.period
+    width = max(1, round(_SMOOTHED / trial.period))
+    reference = np.convolve(trial.reference, np.ones(width) / width, mode="same")
+    rate = np.gradient(reference, trial.period)
+    step = float(np.median(np.diff(time)))
     rows = []
-    for trial in trials:
-        if not {"motor_current", "encoder_position"} <= set(trial.signals):
+    for closure in trial.closures:
+        at = np.arange(closure.start, closure.stop, step)
+        position = np.interp(at, *trial.signals["encoder_position"])
+        if at.size < 8:
             continue
-        time, current = trial.signals["motor_current"]
-        signed = float(current.min()) < -0.05 * float(current.max())
-        ticks = np.arange(trial.reference.size) * trial.period
-        width = max(1, round(_SMOOTHED / trial.period))
-        reference = np.convolve(trial.reference, np.ones(width) / width, mode="same")
-        rate = np.gradient(reference, trial.period)
-        step = float(np.median(np.diff(time)))
-        for closure in trial.closures:
-            at = np.arange(closure.start, closure.stop, step)
-            position = np.interp(at, *trial.signals["encoder_position"])
-            if at.size < 8:
-                continue
-            velocity = np.gradient(position, at)
-            r, dr = np.interp(at, ticks, reference), np.interp(at, ticks, rate)
-            moving = (np.abs(velocity) if signed else velocity) > 0.1 * velocity.max()
-            rows.append(np.column_stack([np.interp(at, time, current), velocity, dr, r - position])[moving])
+        velocity = np.gradient(position, at)
+        r, dr = np.interp(at, ticks, reference), np.interp(at, ticks, rate)
+        moving = (np.abs(velocity) if signed else velocity) > 0.1 * velocity.max()
+        rows.append(np.column_stack([np.interp(at, time, current), velocity, dr, r - position])[moving])
     table = np.concatenate(rows) if rows else np.zeros((0, 4))
     if table.shape[0] < 30:
         return None
-    (per_ampere, lag, delay), *_ = np.linalg.lstsq(table[:, :3], table[:, 3], rcond=None)
+    known, error = table[:, :3], table[:, 3]
+    solution, *_ = np.linalg.lstsq(known, error, rcond=None)
+    per_ampere, lag, delay = (float(x) for x in solution)
     if per_ampere <= 0.0 or lag <= 0.0 or abs(delay) > 0.2:
         return None
-    return float(1.0 / per_ampere), float(lag / per_ampere), float(delay)
+    left = float(np.linalg.norm(error - known @ solution) / np.linalg.norm(error))
+    return left, (1.0 / per_ampere, lag / per_ampere, delay)
 
 
 def _moved(reference: Array, delay: float, lead: float, trial: Trial) -> Array:

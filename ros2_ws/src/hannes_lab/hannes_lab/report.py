@@ -22,6 +22,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from . import report_text as text
+from .experiments import VISIBLE
 from .report_svg import curve_svg, overlay_svg, tick_text
 
 Part = Mapping[str, Any]
@@ -35,9 +36,6 @@ HOT = 30.0
 
 DECADES = 8.0
 """Ratio of largest to smallest error from which the error's fall is shown on a logarithmic scale."""
-
-VISIBLE = 3.0
-"""Whitened distance from which two models can be told apart by an experiment."""
 
 RANKS = 8
 """Rows of the ranking that are open at first."""
@@ -526,9 +524,9 @@ def ranking(diagnosis: Part | None) -> dict[str, Any] | None:
     critical, nominal = (
         text.known((diagnosis.get("costs") or {}).get(k)) for k in ("critical", "nominal_fitted")
     )
-    # Below the critical value there is no misfit to share out: percentages of it would say nothing.
-    excess = critical is None or nominal is None or nominal > critical
     found = {str(e.get("name")) for e in _list(diagnosis, "effects")}
+    # Below the critical value there is no misfit to share out, unless an effect gained more than chance does.
+    excess = critical is None or nominal is None or nominal > critical or bool(found)
     out = []
     for row in rows:
         cost, share = text.known(row.get("cost")), text.known(row.get("explained")) if excess else None

@@ -17,7 +17,7 @@ class EncoderOffset(Effect):
     title = "encoder offset"
     parameters = (EffectParameter("offset", "rad", -2.0, 2.0, 0.3, 0.0, "zero error q_0"),)
     looks_like = "contact and end stops come at shifted encoder angles"
-    told_by = "touch both end stops slowly, from both sides"
+    told_by = "the encoder read before the controller is on; both end stops touched slowly, from both sides"
 
     @staticmethod
     def contribute(x: Any, p: Any, s: Any, y: Any) -> None:

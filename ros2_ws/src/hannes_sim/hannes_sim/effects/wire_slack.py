@@ -18,7 +18,10 @@ class WireSlack(Effect):
     title = "wire slack (loose turns)"
     parameters = (EffectParameter("slack", "rad", 0.0, 5.0, 0.5, 0.0, "free length of the wire"),)
     looks_like = "the current rises late when closing starts, the contact comes at a larger motor angle"
-    told_by = "small reversals near the open hand; grasp of a stiff object"
+    told_by = (
+        "small reversals near the open hand, grasp of a stiff object; against an encoder offset, only the encoder read "
+        "before the controller is on"
+    )
 
     @staticmethod
     def contribute(x: Any, p: Any, s: Any, y: Any) -> None:

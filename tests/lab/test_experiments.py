@@ -1,0 +1,51 @@
+"""The experiments that are proposed for a tie: worth recording where they tell the models apart, and only there."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+from hannes_description.model import Model
+from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.executor import Executor
+from hannes_lab.experiments import separating_experiments
+from hannes_lab.hide import make_set
+from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.search import Search
+from hannes_lab.trials import make_trial
+from hannes_sim.effect import strength_of
+
+TELL_APART = 3.0
+
+
+def distance_of_fits(prepared: Prepared, names: Sequence[str]) -> float:
+    search = Search(
+        prepared.problem,
+        prepared.model,
+        prepared.nuisances,
+        effect_sources(only=names, model=prepared.model),
+        executor=Executor(1),
+    )
+    search.null()
+    tied = [search.fitted((name,)) for name in names]
+    return separating_experiments(prepared, search, tied)[0].distance
+
+
+@pytest.fixture(scope="module")
+def undescribed() -> Prepared:
+    """Recordings of a hand on a slack wire that do not say how they were made."""
+    recordings, _ = make_set(Model.load(), [strength_of("wire_slack", 1.0)], seed=21, closures=6)
+    trials = [make_trial(r) for r in recordings]
+    return prepare([replace(t, options={"object": t.options["object"]}) for t in trials], Model.load())
+
+
+def test_nothing_recorded_in_operation_tells_slack_from_an_encoder_offset(undescribed: Prepared) -> None:
+    only = ["wire_slack", "encoder_offset", "gravity"]
+    found = diagnose(undescribed, effect_sources(only=only, model=undescribed.model))
+    assert set(found.tied) == {("wire_slack",), ("encoder_offset",)}
+    assert found.experiments[0].distance < TELL_APART
+    (note,) = (n for n in found.notes if "no further recording" in n)
+    assert "the encoder read before the controller is on" in note
+
+
+def test_another_recording_tells_slack_from_a_glove(undescribed: Prepared) -> None:
+    assert distance_of_fits(undescribed, ["wire_slack", "glove_stiffness"]) > TELL_APART
