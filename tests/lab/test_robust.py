@@ -69,6 +69,22 @@ def pushed(signals: Signals) -> Signals:
     return signals
 
 
+def spiked(**values: float) -> Damage:
+    """A few samples of another size."""
+
+    def damage(signals: Signals) -> Signals:
+        for name, value in values.items():
+            signals[name][1][[100, 101, 400]] = value
+        return signals
+
+    return damage
+
+
+def shifted(signals: Signals) -> Signals:
+    t, v = signals["encoder_position"]
+    return {**signals, "encoder_position": (t, v + 100.0)}
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -86,6 +102,12 @@ def pushed(signals: Signals) -> Signals:
             "encoder counts",
         ),
         (scaled(motor_current=1000.0), "motor_current was multiplied by 0.001"),
+        (spiked(motor_current=80.0), "3 of 615 samples of motor_current are far outside everything else"),
+        (
+            spiked(encoder_position=-3e3),
+            "3 of 615 samples of encoder_position are far outside everything else",
+        ),
+        (shifted, "encoder_position rests 100 rad from reference_position and was shifted by that"),
     ],
 )
 def test_it_works_through_and_says_so(
@@ -110,6 +132,7 @@ def test_it_works_through_and_says_so(
     [
         (without("reference_position"), "reference_position"),
         (scaled(encoder_position=3.8), "at another shaft"),
+        (scaled(encoder_position=19.0), "at another shaft"),
         (scaled(encoder_position=-1.0), "--scale encoder_position=-1"),
         (cut(1.7, 17.0), "no closure was found"),
     ],

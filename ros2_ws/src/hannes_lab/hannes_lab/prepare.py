@@ -21,7 +21,8 @@ from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig
 from .settle import settle
 from .surrogate import rig_for
-from .trials import SIGNALS, Closure, NoClosure, Trial, make_trial, stem_of, unique_names
+from .trials import SIGNALS, Closure, NoClosure, Trial, compared, stem_of, trial_of, unique_names
+from .units import in_si
 
 OUTLIER = 6.0
 """A closure whose distance from the median closure exceeds this multiple of the median distance is left out."""
@@ -78,7 +79,7 @@ def load_trials(
 ) -> list[Trial]:
     """Trials of all bags below the paths; names are made unique.
 
-    scale    factors to SI by signal name
+    scale    factors to SI by signal name; other units and signs are guessed from all recordings together
     objects  what was grasped, by the name of the condition or of the bag
     Bags of a few closures each that repeat one condition become one trial (join.py).  Bags without a whole closure, and
     those that are there already, are left out with a note.
@@ -86,12 +87,13 @@ def load_trials(
     loaded: list[Loaded] = []
     empty: list[NoClosure] = []
     left_out: list[str] = []
-    for bag in find_bags(paths):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the reader's warnings are kept in the trial's notes
-            recording = read_bag(bag)
+    bags = find_bags(paths)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the reader's warnings are kept in the trial's notes
+        read = [compared(read_bag(bag), signals) for bag in bags]
+    for bag, recording in zip(bags, in_si(read, scale or {}), strict=True):
         try:
-            trial = make_trial(recording, signals=signals, scale=scale)
+            trial = trial_of(recording)
         except NoClosure as none:
             empty.append(none)
             left_out.append(f"'{bag}': {none}")

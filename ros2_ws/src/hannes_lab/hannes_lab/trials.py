@@ -288,6 +288,12 @@ def make_trial(
     scale   factors to SI by signal name, where the recording is in other units
     Raises HannesError where the recording has no reference or none of the signals.
     """
+    (converted,) = in_si([compared(recording, signals)], scale or {})
+    return trial_of(converted, name=name, period=period)
+
+
+def compared(recording: Recording, signals: Sequence[str] = SIGNALS) -> Recording:
+    """The recording with nothing but its reference and what is compared of it."""
     recording.require(["reference_position"])
     present = [s for s in signals if s in recording.channels]
     if "motor_current" not in present and "motor_effort" in recording.channels:
@@ -297,23 +303,22 @@ def make_trial(
             f"{recording.source}: none of the signals {', '.join(signals)} is recorded; nothing can be "
             "compared."
         )
-    # Units are said below, with what was done.
-    notes = [w for w in recording.warnings if "which looks like" not in w]
+    return replace(recording, channels={s: recording[s] for s in ("reference_position", *present)})
+
+
+def trial_of(recording: Recording, *, name: str | None = None, period: float = 1e-3) -> Trial:
+    """The trial of a recording in SI with nothing but what is compared."""
+    notes = list(recording.warnings)
     meta = recording.metadata
     name = name or str(meta.get("condition") or stem_of(recording.source))
     channel = recording["reference_position"]
     origin = float(channel.time[0])
     origin = math.floor(origin / period + 1e-6) * period
-    duration = max(float(recording[s].time[-1]) for s in ("reference_position", *present)) - origin
-    samples, said = in_si(
-        {
-            s: (np.asarray(recording[s].time) - origin, np.asarray(recording[s].values, dtype=float))
-            for s in ("reference_position", *present)
-        },
-        scale or {},
-        recording.source,
-    )
-    notes += said
+    duration = recording.end - origin
+    samples = {
+        s: (np.asarray(c.time) - origin, np.asarray(c.values, dtype=float))
+        for s, c in recording.channels.items()
+    }
     reference, note = reference_on_grid(
         *samples.pop("reference_position"),
         period,
