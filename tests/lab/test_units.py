@@ -179,9 +179,10 @@ def test_an_encoder_that_rests_far_from_its_reference_is_shifted() -> None:
         in_si([both[0], shifted(closing("other"), 200.0)], {})
 
 
-@pytest.mark.parametrize("by", [0.05, -1.0, 1.3])
-def test_a_small_offset_of_the_encoder_is_left_to_the_fit(by: float) -> None:
-    (one,) = in_si([shifted(closing(), by)], {})
+@pytest.mark.parametrize(("by", "span"), [(0.05, 13.0), (-1.0, 13.0), (1.3, 13.0), (0.9, 0.6)])
+def test_a_small_offset_of_the_encoder_is_left_to_the_fit(by: float, span: float) -> None:
+    part = span / 13.0
+    (one,) = in_si([shifted(closing(encoder_position=part, reference_position=part), by)], {})
     assert not one.warnings
     assert values(one, "encoder_position").min() == pytest.approx(by, abs=1e-9)
 

@@ -45,7 +45,9 @@ FREE = 0.7
 """The same in a free closure, at least: some recording must reach it before the encoder's unit is taken for another."""
 
 SHIFT = 1.0
-"""Spans of the reference: an encoder that rests farther from it is nowhere between open and closed, but shifted."""
+LEAST_SHIFT = 1.0
+"""Spans of the reference, and rad: an encoder that rests farther from it than both is nowhere between open and closed,
+but shifted.  Smaller offsets are what the lab fits and looks for."""
 
 SAME_SHIFT = 0.1
 """Spans by which the shift may differ between recordings of one encoder; a rest position scatters by less."""
@@ -218,7 +220,8 @@ def _shift_back(ones: Sequence[_One]) -> None:
     """An encoder that rests farther than a span from its reference, by one constant in all recordings, is shifted."""
     rests = [(one.where, *rest) for one in ones if (rest := _rest(one)) is not None]
     span = max((one.asked for one in ones), default=0.0)
-    if not any(abs(off) > SHIFT * span and abs(at) > abs(at - off) for _, at, off in rests):
+    limit = max(SHIFT * span, LEAST_SHIFT)
+    if not any(abs(off) > limit and abs(at) > abs(at - off) for _, at, off in rests):
         return
     offs = [off for _, _, off in rests]
     if np.ptp(offs) > SAME_SHIFT * span:
