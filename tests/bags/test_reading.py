@@ -85,7 +85,8 @@ def test_any_namespace_and_renamed_topics(tmp_path: Path) -> None:
     assert "motor_current" in read_bag(path, topics={"motor_current": "/amps"})
     with pytest.raises(HannesError, match=r"no message on /volts.*/amps"):
         read_bag(path, topics={"motor_current": "volts"})
-    with pytest.raises(HannesError, match="unknown signal 'amps'"):
+    assert read_bag(path).metadata["bag"]["unread"] == {"/amps": "std_msgs/msg/Float64"}
+    with pytest.raises(HannesError, match=r"unknown signal 'amps'.*motor_current"):
         read_bag(path, topics={"amps": "/amps"})
     two = {**motor_messages(STAMPS), **motor_messages(STAMPS, prefix="/other")}
     path = foreign_bag(tmp_path / "c", two)
@@ -105,6 +106,56 @@ def test_no_known_topic(tmp_path: Path) -> None:
         read_bag(path)
 
 
+def plain(msgtype: str, values: np.ndarray) -> tuple[str, list[tuple[int, bytes]]]:
+    """Messages of one number, one for each of STAMPS."""
+    store = cdr.typestore()
+    kind = store.types[msgtype]
+    return msgtype, [
+        (log, bytes(store.serialize_cdr(kind(value), msgtype)))
+        for log, value in zip(STAMPS.tolist(), values.tolist(), strict=True)
+    ]
+
+
+@pytest.mark.parametrize("msgtype", sorted(cdr.NUMBERS))
+def test_any_plain_number(tmp_path: Path, msgtype: str) -> None:
+    values = np.arange(300) % 50 - (0 if "UInt" in msgtype else 25)
+    number = values.astype(np.float64 if "Float" in msgtype else np.int64)
+    entry = plain(msgtype, number)
+    path = foreign_bag(tmp_path / "a", {"/reference_position": entry, "/enc": entry})
+    back = read_bag(path, topics={"encoder_position": "/enc"})
+    assert set(back.channels) == {"reference_position", "encoder_position"}
+    for channel in back.channels.values():
+        assert np.array_equal(channel.values, number)
+        assert np.array_equal(channel.time, (STAMPS - STAMPS[0]) / 1e9), "the log times are the stamps"
+    padded = [(log, data + bytes(-len(data) % 4)) for log, data in entry[1]]
+    back = read_bag(foreign_bag(tmp_path / "b", {"/reference_position": (msgtype, padded)}))
+    assert np.array_equal(back["reference_position"].values, number)
+
+
+def test_a_reference_that_is_a_joint_state_and_a_velocity_of_its_own_topic(tmp_path: Path) -> None:
+    messages = motor_messages(STAMPS, prefix="/rig")
+    command = cdr.encode_joint_states(STAMPS, ("any",), np.cos(STAMPS * 1e-9)[:, None])
+    messages["/rig/command"] = (cdr.JOINT_STATE, list(zip(STAMPS.tolist(), command, strict=True)))
+    messages["/rig/velocity"] = plain("std_msgs/msg/Float32", 4.0 * np.ones(300))
+    path = foreign_bag(tmp_path / "a", messages)
+    named = {"reference_position": "/rig/command", "encoder_velocity": "/rig/velocity", "motor_effort": None}
+    back = read_quietly(path, topics=named)
+    assert set(back.channels) == {
+        "reference_position",
+        "encoder_position",
+        "encoder_velocity",
+        "motor_current",
+    }
+    assert np.array_equal(back["reference_position"].values, np.cos(STAMPS * 1e-9))
+    assert (back["encoder_velocity"].values == 4.0).all()
+    assert back.metadata["clock"]["topic"] == "/rig/motor/state", "the encoder's stamps lead"
+    assert set(read_bag(path, topics={"encoder_position": None}).channels) == {"motor_current"}
+    with pytest.raises(HannesError, match="/rig/command is named for two signals"):
+        read_bag(path, topics={"reference_position": "/rig/command", "motor_current": "/rig/command"})
+    with pytest.raises(HannesError, match="/rig/command is a sensor_msgs/msg/JointState, but motor_current"):
+        read_bag(path, topics={"motor_current": "/rig/command"})
+
+
 def test_wrong_type(tmp_path: Path) -> None:
     entry = (cdr.STRING, [(5, cdr.encode_strings(["3 N"])[0])])
     path = foreign_bag(tmp_path / "a", {**motor_messages(STAMPS), "/hannes/grip_force": entry})
@@ -114,6 +165,9 @@ def test_wrong_type(tmp_path: Path) -> None:
     ):
         read_bag(path)
     assert "grip_force" not in read_bag(path, topics={"grip_force": None})
+    path = foreign_bag(tmp_path / "b", {**motor_messages(STAMPS), "/hannes/reference_position": entry})
+    with pytest.raises(HannesError, match=r"Name another topic with --topic SIGNAL=TOPIC \(.*Python\)\.$"):
+        read_bag(path)
 
 
 def test_the_encoder_by_name_or_alone(tmp_path: Path) -> None:
@@ -240,12 +294,17 @@ def test_swapped_neighbours_are_sorted_and_repeats_dropped(tmp_path: Path) -> No
     stamps = STAMPS.copy()
     stamps[[10, 11]] = stamps[[11, 10]]
     back = read_quietly(foreign_bag(tmp_path / "a", motor_messages(stamps, STAMPS)))
-    assert any("1 samples of encoder_position came out of order" in text for text in back.warnings)
+    assert any("1 sample of encoder_position came out of order" in text for text in back.warnings)
     assert np.array_equal(back["encoder_position"].values, np.sin(STAMPS * 1e-9))
     repeated = np.concatenate([STAMPS[:5], STAMPS[4:]])
     logs = np.arange(301) * 1_000_000
-    back = read_bag(foreign_bag(tmp_path / "b", motor_messages(repeated, logs)))
-    assert back["encoder_position"].time.size == 300
+    messages = motor_messages(repeated, logs)
+    currents = messages["/hannes/motor/current"][1]
+    currents[8:8] = 2 * [currents[7]]
+    back = read_quietly(foreign_bag(tmp_path / "b", messages))
+    assert back["encoder_position"].time.size == 300 and back["motor_current"].time.size == 301
+    said = "stamp too, were left out: 1 on /hannes/motor/state, 2 on /hannes/motor/current."
+    assert any(said in text for text in back.warnings)
 
 
 # ---- what is on disk ----------------------------------------------------------------------------------------------

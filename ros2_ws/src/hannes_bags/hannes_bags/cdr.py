@@ -28,6 +28,13 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
 FLOAT64_MULTI_ARRAY = "std_msgs/msg/Float64MultiArray"
 CLOCK = "rosgraph_msgs/msg/Clock"
+NUMBERS = {
+    "std_msgs/msg/Float32": "<f4",
+    FLOAT64: "<f8",
+    **{f"std_msgs/msg/Int{8 * size}": f"<i{size}" for size in (1, 2, 4, 8)},
+    **{f"std_msgs/msg/UInt{8 * size}": f"<u{size}" for size in (1, 2, 4, 8)},
+}
+"""Types of one number, with its numpy type."""
 
 _LITTLE = b"\x00\x01"
 _ENDIAN = {b"\x00\x01": "<", b"\x00\x00": ">"}
@@ -94,9 +101,10 @@ def definition(msgtype: str) -> tuple[str, str]:
     return text, store.hash_rihs01(msgtype)
 
 
-def decode_float64(raw: RawTopic) -> FloatArray:
-    """(n,) values of std_msgs/Float64 messages. Raises CdrError."""
-    return _fixed(raw, "<f8", 8)[:, 0].astype(np.float64)
+def decode_numbers(raw: RawTopic, msgtype: str) -> FloatArray:
+    """(n,) values of messages of one of the types NUMBERS. Raises CdrError."""
+    dtype = NUMBERS[msgtype]
+    return _fixed(raw, dtype, np.dtype(dtype).itemsize)[:, 0].astype(np.float64)
 
 
 def decode_clock(raw: RawTopic) -> IntArray:
@@ -107,16 +115,18 @@ def decode_clock(raw: RawTopic) -> IntArray:
 
 def _fixed(raw: RawTopic, dtype: str, size: int) -> npt.NDArray[Any]:
     lengths = np.frombuffer(raw.lengths, dtype=np.int64)
-    wrong = np.flatnonzero(lengths != 4 + size)
+    padded = -(-size // 4) * 4  # some middlewares fill up the last word
+    length = 4 + (padded if len(raw) and lengths[0] == 4 + padded else size)
+    wrong = np.flatnonzero(lengths != length)
     if wrong.size:
-        raise CdrError(f"it has {lengths[wrong[0]]} bytes instead of {4 + size}", int(wrong[0]))
-    rows = np.frombuffer(raw.payload, dtype=np.uint8).reshape(len(raw), 4 + size)
+        raise CdrError(f"it has {lengths[wrong[0]]} bytes instead of {length}", int(wrong[0]))
+    rows = np.frombuffer(raw.payload, dtype=np.uint8).reshape(len(raw), length)
     big = (rows[:, 0] == 0) & (rows[:, 1] == 0)
     little = (rows[:, 0] == 0) & (rows[:, 1] == 1)
     wrong = np.flatnonzero(~(big | little))
     if wrong.size:
         raise CdrError("it does not begin as CDR", int(wrong[0]))
-    body = np.ascontiguousarray(rows[:, 4:])
+    body = np.ascontiguousarray(rows[:, 4 : 4 + size])
     values = body.view(dtype)
     if big.any():
         values = np.where(big[:, None], body.view(dtype.replace("<", ">")), values)

@@ -1,7 +1,7 @@
 """Bag -> Recording.
 
-Topics are recognised by their canonical name under any namespace, joints by their name, types exactly.
-JointState messages count at their header stamp, header-less ones at their log time; `clocks` says what
+Topics are recognised by their canonical name under any namespace, joints by their name; a number may be of any
+plain type.  JointState messages count at their header stamp, header-less ones at their log time; `clocks` says what
 happens if those are two clocks. What is wrong with the file or the data is one HannesError; what is merely
 suspicious is a sentence in `metadata["warnings"]`.
 """
@@ -23,7 +23,7 @@ from hannes_description.signals import SIGNALS, Signal
 from . import cdr
 from .clocks import SAME_NS, ClockRelation, relate
 from .mcap_file import Limits
-from .recording import Channel, Recording
+from .recording import HOW_TO_NAME, Channel, Recording
 from .storage import BagMessages, TopicEntry, locate
 
 IntArray = npt.NDArray[np.int64]
@@ -31,9 +31,8 @@ IntArray = npt.NDArray[np.int64]
 RESERVED = ("warnings", "bag", "clock", "start_ns")
 """Metadata entries that reading sets; they are not written back."""
 
-_FIELDS = {"position": "position", "velocity": "velocity", "effort": "effort"}
+_JOINT_SIGNALS = ("joint_positions", "joint_velocities")
 _ENCODER_TOPIC = SIGNALS["encoder_position"].topic
-_JOINTS_TOPIC = SIGNALS["joint_positions"].topic
 
 _PLAUSIBLE: Mapping[str, tuple[float, str]] = {
     "encoder_position": (1000.0, "encoder counts (40000 counts are 14.57 rad)"),
@@ -97,7 +96,8 @@ def read_bag(
     """Read a rosbag2 bag (folder, .mcap or .db3 file) into a Recording.
 
     topics  by signal name (or canonical topic), the topic that carries it where the name says it differently,
-            or where two topics might be meant; None leaves the signal out
+            or where two topics might be meant; None leaves the signal out; what is said of encoder_position or
+            joint_positions holds for what else is on their topic
     limits  how much is read at most; by default 5 million messages and 1 GiB
 
     Raises HannesError: unreadable or damaged bag, ambiguous or missing topic, wrong type, undecodable
@@ -120,19 +120,26 @@ def read_bag(
 
 
 def _overrides(topics: Mapping[str, str | None]) -> dict[str, str | None]:
-    """By canonical topic, the bag's topic that stands for it."""
-    known = {signal.topic for signal in SIGNALS.values()}
+    """By signal name, the bag's topic that stands for it."""
+    first = {signal.topic: signal.name for signal in reversed(tuple(SIGNALS.values()))}
     resolved: dict[str, str | None] = {}
     for key, topic in topics.items():
-        canonical = SIGNALS[key].topic if key in SIGNALS else key
-        if canonical not in known:
-            raise HannesError(f"topics: unknown signal {key!r}. Known signals: {', '.join(SIGNALS)}.")
-        name = None if topic is None else "/" + topic.strip("/")
-        if resolved.get(canonical, name) != name:
+        signal = first.get(key, key)
+        if signal not in SIGNALS:
             raise HannesError(
-                f"topics: two topics are named for {canonical}: {resolved[canonical]} and {name}."
+                f"--topic (topics= in Python): unknown signal {key!r}. Known signals: {', '.join(SIGNALS)}."
             )
-        resolved[canonical] = name
+        name = None if topic is None else "/" + topic.strip("/")
+        if resolved.get(signal, name) != name:
+            raise HannesError(
+                f"--topic (topics= in Python): two topics are named for {signal}: {resolved[signal]} and {name}."
+            )
+        for other, taken in resolved.items():
+            if name is not None and taken == name and SIGNALS[other].topic != SIGNALS[signal].topic:
+                raise HannesError(
+                    f"--topic (topics= in Python): {name} is named for two signals, {other} and {signal}."
+                )
+        resolved[signal] = name
     return resolved
 
 
@@ -140,6 +147,11 @@ def _canonical_of(topic: str) -> str | None:
     name = "/" + topic.strip("/")
     found = [signal.topic for signal in SIGNALS.values() if name.endswith("/" + signal.topic)]
     return max(found, key=len) if found else None
+
+
+def _naming(signal: str, topic: str | None) -> str:
+    """How this topic is said for a signal, on the command line and in Python."""
+    return f"--topic {signal}={topic or ''} (topics={{{signal!r}: {topic!r}}} in Python)"
 
 
 class _Reader:
@@ -157,6 +169,7 @@ class _Reader:
         self.raw = raw
         self.overrides = overrides
         self.warnings: list[str] = []
+        self.repeats: dict[str, int] = {}
 
     def recording(self, sha256: str) -> Recording:
         chosen = self._choose()
@@ -165,23 +178,29 @@ class _Reader:
             wanted = ", ".join(dict.fromkeys(signal.topic for signal in SIGNALS.values()))
             raise HannesError(
                 f"The bag {self.path} has none of the topics {wanted}, under any namespace. It has: {present}. "
-                "Name the topics with topics={signal: topic}."
+                f"Name the topics with {HOW_TO_NAME}; the signals are {', '.join(SIGNALS)}."
             )
+        carried: dict[str, list[Signal]] = {}
+        for name, topic in chosen.items():
+            carried.setdefault(topic, []).append(SIGNALS[name])
+        encoder_first = sorted(carried, key=lambda topic: carried[topic][0].topic != _ENCODER_TOPIC)
         states = {
-            topic: self._decode(topic, cdr.decode_joint_states)
-            for topic in chosen.values()
-            if self._is(topic)
+            topic: self._decode(topic, cdr.decode_joint_states) for topic in encoder_first if self._is(topic)
         }
         relation = self._relation(states)
         samples: dict[str, tuple[IntArray, npt.NDArray[Any]]] = {}
-        for canonical, topic in chosen.items():
-            signals = [signal for signal in SIGNALS.values() if signal.topic == canonical]
+        for topic, signals in carried.items():
             if topic in states:
                 self._joint_channels(topic, signals, states[topic], relation, samples)
             else:
-                times, values = self._plain(topic, signals[0])
+                times, values = self._plain(topic)
                 samples[signals[0].name] = (relation.apply(times), values)
-                self._drop_repeats([signals[0].name], samples)
+                self._drop_repeats(topic, [signals[0].name], samples)
+        if self.repeats:
+            told = ", ".join(f"{count} on {topic}" for topic, count in self.repeats.items())
+            self.warnings.append(
+                f"Messages that repeat the one before, its stamp too, were left out: {told}."
+            )
         ordered = {
             name: self._in_order(name, *finite)
             for name in SIGNALS
@@ -192,39 +211,58 @@ class _Reader:
         return self._assemble(ordered, chosen, relation, sha256)
 
     def _choose(self) -> dict[str, str]:
-        """By canonical topic, the bag's topic that carries it."""
+        """By signal, the bag's topic that carries it."""
         chosen: dict[str, str] = {}
         for canonical in dict.fromkeys(signal.topic for signal in SIGNALS.values()):
-            if canonical in self.overrides:
-                named = self.overrides[canonical]
-                if named is None:
+            first, *others = [signal for signal in SIGNALS.values() if signal.topic == canonical]
+            leading = self._named(first.name) if first.name in self.overrides else self._found(first)
+            for signal in (first, *others):
+                topic = self._named(signal.name) if signal.name in self.overrides else leading
+                if topic is None or (topic == leading and signal is not first and not self._is(topic)):
                     continue
-                if named not in self.raw:
-                    present = ", ".join(self.messages.types)
-                    raise HannesError(
-                        f"The bag {self.path} has no message on {named}. Its topics: {present}."
-                    )
-                chosen[canonical] = named
-                continue
-            taken = set(self.overrides.values())
-            candidates = sorted(
-                topic for topic in self.raw if _canonical_of(topic) == canonical and topic not in taken
-            )
-            if len(candidates) > 1:
-                raise HannesError(
-                    f"The bag {self.path} has several topics that may be {canonical}: {', '.join(candidates)}. "
-                    f"Say which one with topics={{{canonical!r}: {candidates[0]!r}}}."
-                )
-            if candidates:
-                chosen[canonical] = candidates[0]
-        for canonical, topic in chosen.items():
-            expected = next(signal.type for signal in SIGNALS.values() if signal.topic == canonical)
-            if self.messages.types[topic] != expected:
-                raise HannesError(
-                    f"The bag {self.path}: topic {topic} is a {self.messages.types[topic]}, but {canonical} is a "
-                    f"{expected}. Name another topic, or leave it out with topics={{{canonical!r}: None}}."
-                )
+                self._check_type(signal, topic)
+                chosen[signal.name] = topic
         return chosen
+
+    def _named(self, signal: str) -> str | None:
+        """The topic that the user names for a signal."""
+        named = self.overrides[signal]
+        if named is not None and named not in self.raw:
+            present = ", ".join(self.messages.types)
+            raise HannesError(
+                f"The bag {self.path} has no message on {named}, which is named for {signal}. Its topics: {present}."
+            )
+        return named
+
+    def _found(self, signal: Signal) -> str | None:
+        """The topic that is called as the signal's."""
+        candidates = sorted(
+            topic
+            for topic in self.raw
+            if _canonical_of(topic) == signal.topic and topic not in self.overrides.values()
+        )
+        if len(candidates) > 1:
+            raise HannesError(
+                f"The bag {self.path} has several topics that may be {signal.topic}: {', '.join(candidates)}. "
+                f"Say which one with {_naming(signal.name, candidates[0])}."
+            )
+        return candidates[0] if candidates else None
+
+    def _check_type(self, signal: Signal, topic: str) -> None:
+        """Refuse a type that cannot be the signal; a number may be of any plain type, or the only joint's position."""
+        found = self.messages.types[topic]
+        usable = {signal.type}
+        if signal.type == cdr.FLOAT64 or signal.topic == _ENCODER_TOPIC:
+            usable |= set(cdr.NUMBERS)
+        if signal.name == "reference_position":
+            usable.add(cdr.JOINT_STATE)
+        if found not in usable:
+            needed = signal.name == "reference_position"
+            or_not = "" if needed else f", or leave it out with {_naming(signal.name, None)}"
+            raise HannesError(
+                f"The bag {self.path}: topic {topic} is a {found}, but {signal.name} is a {signal.type}. "
+                f"Name another topic with {HOW_TO_NAME}{or_not}."
+            )
 
     def _is(self, topic: str) -> bool:
         return self.messages.types[topic] == cdr.JOINT_STATE
@@ -238,13 +276,14 @@ class _Reader:
                 f"{self.messages.types[topic]}: {error.what}."
             ) from None
 
-    def _plain(self, topic: str, signal: Signal) -> tuple[IntArray, npt.NDArray[Any]]:
+    def _plain(self, topic: str) -> tuple[IntArray, npt.NDArray[Any]]:
+        msgtype = self.messages.types[topic]
         decoders = {
-            cdr.FLOAT64: cdr.decode_float64,
             cdr.STRING: lambda raw: np.array(cdr.decode_strings(raw)),
             cdr.FLOAT64_MULTI_ARRAY: cdr.decode_multi_arrays,
         }
-        return self._log_ns(topic), self._decode(topic, decoders[signal.type])
+        decode = decoders.get(msgtype, lambda raw: cdr.decode_numbers(raw, msgtype))
+        return self._log_ns(topic), self._decode(topic, decode)
 
     def _log_ns(self, topic: str) -> IntArray:
         return np.frombuffer(self.raw[topic].log_ns, dtype=np.int64)
@@ -291,7 +330,7 @@ class _Reader:
         times = self.stamps.get(topic)
         if times is None:
             times = relation.apply(self._log_ns(topic))
-        scalar = signals[0].topic == _ENCODER_TOPIC
+        scalar = signals[0].name not in _JOINT_SIGNALS
         columns = [self._columns(topic, block, scalar) for block in blocks]
         usable = [
             (block, column) for block, column in zip(blocks, columns, strict=True) if column is not None
@@ -305,34 +344,37 @@ class _Reader:
         if skipped:
             self.warnings.append(f"{skipped} messages on {topic} are of other joints; they were left out.")
         for signal in signals:
-            fields = [(block, column, getattr(block, _FIELDS[signal.field])) for block, column in usable]
+            part = "position" if signal.field == "data" else signal.field
+            fields = [(block, column, getattr(block, part)) for block, column in usable]
             missing = [
                 field.shape[1] == 0 or bool(np.isnan(field[:, column]).all()) for _, column, field in fields
             ]
             if all(missing):
                 # velocity and effort are optional in a JointState: to leave them out is no fault
-                if signal.field == "position" or any(field.shape[1] for _, _, field in fields):
+                if part == "position" or any(field.shape[1] for _, _, field in fields):
                     self.warnings.append(
-                        f"The messages on {topic} have no {signal.field}: there is no {signal.name}."
+                        f"The messages on {topic} have no {part}: there is no {signal.name}."
                     )
                 continue
             if any(field.shape[1] not in (0, len(block.names) or 1) for block, _, field in fields):
                 raise HannesError(
-                    f"The bag {self.path}: {topic} has another number of {signal.field}s than of names."
+                    f"The bag {self.path}: {topic} has another number of {part}s than of names."
                 )
             present = [entry for entry in fields if entry[2].shape[1]]
             indices = np.concatenate([block.indices for block, _, _ in present])
             values = np.concatenate([field[:, column] for _, column, field in present])
             order = np.argsort(indices, kind="stable")
             samples[signal.name] = (times[indices[order]], values[order])
-        self._drop_repeats([signal.name for signal in signals if signal.name in samples], samples)
+        self._drop_repeats(topic, [signal.name for signal in signals if signal.name in samples], samples)
         if scalar:
             for signal in signals:
                 if signal.name in samples:
                     stamps, values = samples[signal.name]
                     samples[signal.name] = (stamps, values[:, 0])
 
-    def _drop_repeats(self, names: list[str], samples: dict[str, tuple[IntArray, npt.NDArray[Any]]]) -> None:
+    def _drop_repeats(
+        self, topic: str, names: list[str], samples: dict[str, tuple[IntArray, npt.NDArray[Any]]]
+    ) -> None:
         """Leave out messages that repeat the one before, stamp and all (lock-step repeats for newcomers)."""
         if not names or len({len(samples[name][0]) for name in names}) != 1:
             return
@@ -345,6 +387,7 @@ class _Reader:
             unequal = (values[1:] != values[:-1]).reshape(len(values) - 1, -1).any(axis=1)
             repeated[1:] &= ~unequal
         if repeated.any():
+            self.repeats[topic] = int(repeated.sum())
             for name in names:
                 samples[name] = (samples[name][0][~repeated], samples[name][1][~repeated])
 
@@ -408,8 +451,9 @@ class _Reader:
                 "the clock was set. Record each run into a bag of its own."
             )
         order = np.argsort(times, kind="stable")
+        count = int((back < 0).sum())
         self.warnings.append(
-            f"{int((back < 0).sum())} samples of {name} came out of order; they were sorted by time."
+            f"{count} sample{'s' * (count > 1)} of {name} came out of order; all were sorted by time."
         )
         return times[order], values[order]
 
@@ -436,7 +480,8 @@ class _Reader:
             "storage": self.messages.bag.storage,
             "files": [file.name for file in self.messages.bag.files],
             "messages": sum(self.messages.counts.values()),
-            "topics": {name: chosen[SIGNALS[name].topic] for name in channels},
+            "topics": {name: chosen[name] for name in channels},
+            "unread": {n: t for n, t in self.messages.types.items() if n not in chosen.values()},
         }
         metadata["clock"] = {
             "kind": relation.kind,

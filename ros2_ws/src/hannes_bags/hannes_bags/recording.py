@@ -24,6 +24,9 @@ FloatArray = npt.NDArray[np.float64]
 Method = Literal["linear", "previous", "nearest"]
 
 _TEXT_SIGNALS = frozenset(name for name, signal in SIGNALS.items() if signal.type == "std_msgs/msg/String")
+HOW_TO_NAME = "--topic SIGNAL=TOPIC (topics={signal: topic} in Python)"
+"""How the topic of a signal is said, on the command line and in Python."""
+
 _COLUMNS = {"joint_positions": len(JOINT_NAMES), "joint_velocities": len(JOINT_NAMES)}
 _VECTOR_SIGNALS = frozenset(_COLUMNS) | {
     name for name, signal in SIGNALS.items() if signal.type == "std_msgs/msg/Float64MultiArray"
@@ -198,8 +201,14 @@ class Recording:
             topics = ", ".join(f"{name} (topic {SIGNALS[name].topic})" for name in missing)
             raise HannesError(
                 f"The recording {self.source or '(in memory)'} lacks {topics}. It has: {', '.join(self.channels)}. "
-                "If the signal was recorded under another topic name, say so with topics={signal: topic}."
+                + self.elsewhere()
             )
+
+    def elsewhere(self) -> str:
+        """How to say that a signal was recorded under another topic, and which topics of the bag were not read."""
+        unread = ", ".join(f"{n} ({t})" for n, t in self.metadata.get("bag", {}).get("unread", {}).items())
+        others = f"not read were {unread}" if unread else "the bag has no other topic"
+        return f"If it was recorded under another topic, name that with {HOW_TO_NAME}; {others}."
 
     def slice(self, t0: float, t1: float) -> Recording:
         """The samples with t0 <= time < t1, with t0 as the new time 0; channels without a sample there are
