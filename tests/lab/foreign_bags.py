@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,8 +51,25 @@ def signals_of_set(
     }
 
 
-def write_bag(folder: Path, signals: Signals, *, clock: float = 0.0, sqlite: bool = False) -> None:
-    """A rosbag2 folder; `clock` [s] is added to the header stamps only, as if the motor board had its own clock."""
+def write_bag(
+    folder: Path,
+    signals: Signals,
+    *,
+    clock: float = 0.0,
+    sqlite: bool = False,
+    topics: Mapping[str, str] = TOPICS,
+    number: str = FLOAT.__msgtype__,
+    stamped: bool = True,
+) -> None:
+    """A rosbag2 folder.
+
+    clock    s, added to the header stamps only, as if the motor board had its own clock
+    topics   by signal name
+    number   type of all that is a plain number; the encoder is one too if not `stamped`
+    """
+    kinds = dict.fromkeys(signals, STORE.types[number])
+    if stamped and "encoder_position" in kinds:
+        kinds["encoder_position"] = JOINTS
     events = sorted(
         ((float(t), name, float(v)) for name, pair in signals.items() for t, v in zip(*pair, strict=True)),
         key=lambda event: event[0],
@@ -59,33 +77,27 @@ def write_bag(folder: Path, signals: Signals, *, clock: float = 0.0, sqlite: boo
     plugin = StoragePlugin.SQLITE3 if sqlite else StoragePlugin.MCAP
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         connections = {
-            name: writer.add_connection(
-                TOPICS[name],
-                JOINTS.__msgtype__ if name == "encoder_position" else FLOAT.__msgtype__,
-                typestore=STORE,
-            )
-            for name in signals
+            name: writer.add_connection(topics[name], kind.__msgtype__, typestore=STORE)
+            for name, kind in kinds.items()
         }
         for time, name, value in events:
             log = round((100.0 + time) * 1e9)
-            if name == "encoder_position":
+            if kinds[name] is JOINTS:
                 stamp = round((100.0 + time + clock) * 1e9)
                 header = HEADER(TIME(stamp // 10**9, stamp % 10**9), "")
                 none = np.zeros(0)
                 message = JOINTS(header, ["motor_pulley"], np.array([value]), none, none)
             else:
-                message = FLOAT(value)
+                message = kinds[name](value)
             writer.write(connections[name], log, STORE.serialize_cdr(message, message.__msgtype__))
 
 
-def write_set(
-    folder: Path, conditions: dict[str, Signals], damage: Damage | None = None, **how: float
-) -> Path:
+def write_set(folder: Path, conditions: dict[str, Signals], damage: Damage | None = None, **how: Any) -> Path:
     """One bag per condition below the folder."""
     folder.mkdir(parents=True)
     for name, signals in conditions.items():
         copy = {key: (time.copy(), values.copy()) for key, (time, values) in signals.items()}
-        write_bag(folder / name, damage(copy) if damage else copy, **how)  # type: ignore[arg-type]
+        write_bag(folder / name, damage(copy) if damage else copy, **how)
     return folder
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hannes_lab.calibrate import (
     Remembered,
     Target,
     TargetProblem,
+    _key,
     calibrate,
     calibrate_targets,
     free_coordinates,
@@ -109,6 +111,15 @@ def test_a_cut_file_in_the_cache_is_made_again(tmp_path: Path) -> None:
 def test_bad_names_are_refused(names: list[str], text: str) -> None:
     with pytest.raises(HannesError, match=text):
         free_coordinates(NOMINAL, names)
+
+
+def test_residuals_of_other_signals_of_the_same_bag_are_not_taken_for_these() -> None:
+    recordings, _ = make_set(NOMINAL, [], seed=4, closures=2, conditions=("fast",), sensors="bench")
+    trial = make_trial(recordings[0])
+    time, current = trial.signals["motor_current"]
+    other = replace(trial, signals={**trial.signals, "motor_current": (time, current + 0.1)})
+    keys = {_key(prepare([t], NOMINAL).problem) for t in (trial, trial, other)}
+    assert len(keys) == 2
 
 
 def test_a_hand_is_recovered_from_its_recordings(tmp_path: Path) -> None:

@@ -199,6 +199,12 @@ def settings(bags: Path | str) -> dict[str, Any]:
     return {"bags": [str(bags)], "model": "nominal", "max_effects": 1, "greedy": False, "jobs": 1}
 
 
+def test_the_command_of_the_answer_names_the_topics() -> None:
+    task = {**settings("bags"), "action": "compare", "topics": ["motor_current=/rig/iq", "grip_force="]}
+    said = "hannes compare bags --topic motor_current=/rig/iq --topic grip_force= --report report.html"
+    assert page_worker.command_line(task) == said
+
+
 def files_of(work: Work) -> dict[str, Path]:
     assert work.answer is not None, work.problem
     return {name: work.answer["folder"] / name for name in work.answer["files"]}

@@ -134,6 +134,9 @@ def test_commands_take_the_adapter(
     content = json.loads(capsys.readouterr().out)
     assert {e["unit"] for e in content["errors"]} == {"m", "N"}
     assert content["metrics"] == []
+    monkeypatch.setattr("sys.argv", ["hannes", *words, "--topic", "motor_current=/rig/iq"])
+    assert main() == 2
+    assert "--topic is for bags" in " ".join(capsys.readouterr().err.split())
 
 
 def test_broken_adapters_are_clear_errors(tmp_path: Path) -> None:

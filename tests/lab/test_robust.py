@@ -63,6 +63,12 @@ def all_nan(signals: Signals) -> Signals:
     return signals
 
 
+def doubled(signals: Signals) -> Signals:
+    t, v = signals["motor_current"]
+    again = np.sort(np.concatenate([np.arange(t.size), np.arange(100, 107)]))
+    return {**signals, "motor_current": (t[again], v[again])}
+
+
 def pushed(signals: Signals) -> Signals:
     t, v = signals["encoder_position"]
     v[(t > 8.8) & (t < 10.0)] += 3.0
@@ -90,7 +96,11 @@ def shifted(signals: Signals) -> Signals:
     [
         (cut(1.7, 2.2), "2 of 5 closures are cut off"),
         (cut(0.0, 10.0, "motor_current"), "closures are cut off"),
-        (hole, "1 closures in which samples are missing are left out"),
+        (hole, "1 closure in which samples are missing is left out"),
+        (
+            doubled,
+            "Messages that repeat the one before, its stamp too, were left out: 7 on /hannes/motor/current",
+        ),
         (pushed, "1 closure(s) far from the others are left out"),
         (without("motor_current"), "no current is recorded"),
         (without("encoder_position"), "no encoder position is recorded"),
@@ -130,7 +140,12 @@ def test_it_works_through_and_says_so(
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (without("reference_position"), "reference_position"),
+        (
+            without("reference_position"),
+            "has no reference_position: it is needed, for the model replays it. If it was recorded under another "
+            "topic, name that with --topic SIGNAL=TOPIC (topics={signal: topic} in Python); the bag has no other "
+            "topic.",
+        ),
         (scaled(encoder_position=3.8), "at another shaft"),
         (scaled(encoder_position=19.0), "at another shaft"),
         (scaled(encoder_position=-1.0), "--scale encoder_position=-1"),
@@ -168,6 +183,66 @@ def test_a_factor_of_ones_own(
             "compare", str(bags), "--scale", wrong, capsys=capsys, monkeypatch=monkeypatch
         )
         assert code == 2 and said in err
+
+
+RIG = {"reference_position": "/rig/target", "encoder_position": "/rig/encoder", "motor_current": "/rig/iq"}
+NAMED = [word for name, topic in RIG.items() for word in ("--topic", f"{name}={topic}")]
+
+
+@pytest.mark.parametrize(
+    ("number", "stamped"), [("std_msgs/msg/Float32", True), ("std_msgs/msg/Float64", False)]
+)
+def test_topics_of_other_names_and_types_are_named(
+    number: str,
+    stamped: bool,
+    slow: dict[str, Signals],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bags = write_set(tmp_path / "bags", slow, topics=RIG, number=number, stamped=stamped)
+    code, _, err = hannes_in_one_line("compare", str(bags), capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 2 and "--topic SIGNAL=TOPIC" in err and "/rig/encoder" in err and "motor_current" in err
+    words = ("compare", str(bags), "--fitted", *NAMED)
+    code, out, err = hannes_in_one_line(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0, err
+    assert float(out.split("Overall error: ")[1].split()[0]) < 5.0
+    words = ("compare", str(bags), *NAMED[:-1], "motor_current=", "--json")
+    code, out, err = hannes_in_one_line(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and '"no current is recorded' in out and '"signals": [ "encoder_position" ]' in out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("reference=/rig/target",), "signals are emg_flexor, emg_extensor, reference_position"),
+        (("motor_current",), "give SIGNAL=TOPIC"),
+        (("motor_current=/a", "motor_current=/b"), "another topic is named for motor_current already"),
+        (("motor_current=/rig/amps",), "fast has no message on /rig/amps, which is named for motor_current"),
+        (("reference_position=",), "has no reference_position: it is needed"),
+        (
+            ("encoder_position=", "motor_current="),
+            "name that with --topic SIGNAL=TOPIC (topics={signal: topic} in Python); not read were "
+            "/hannes/motor/state (sensor_msgs/msg/JointState)",
+        ),
+    ],
+)
+def test_a_topic_that_cannot_be_used_is_one_clear_error(
+    words: tuple[str, ...],
+    said: str,
+    good: dict[str, Signals],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = {n: "/hannes/motor/state" if n == "encoder_position" else f"/hannes/{n}" for n in RIG}
+    for condition, current in (("slow", "/rig/amps"), ("fast", "/rig/iq")):
+        write_bag(tmp_path / condition, good[condition], topics={**names, "motor_current": current})
+    given = [word for text in words for word in ("--topic", text)]
+    code, _, err = hannes_in_one_line(
+        "compare", str(tmp_path), *given, capsys=capsys, monkeypatch=monkeypatch
+    )
+    assert code == 2 and said in err and len(err.strip().splitlines()) == 1
 
 
 @pytest.mark.parametrize("clock", [1234.5, -0.06, 0.06])

@@ -38,6 +38,8 @@ from hannes_description.parameters import Parameter, data_path, read_yaml
 from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
+from .cache import content_hash
+from .cli import Scale, Topics
 from .errors import held_out_closures, overall, signal_errors
 from .executor import interruptible
 from .features import data_used
@@ -595,7 +597,7 @@ def calibrate(
     used = data_used(prepared.features)
     # A slow plant may have been prepared through a fast one, which lacks the parameters of the mechanics.
     exact = prepared.problem.with_rig(prepared.rig)
-    remembered = Remembered(exact, _key(exact, used), cache, progress)
+    remembered = Remembered(exact, _key(exact), cache, progress)
     remembered.total = (starts + 1) * evaluations * (len(coordinates) + 1)
 
     def announce(k: int, n: int) -> None:
@@ -606,7 +608,7 @@ def calibrate(
     )
     costs = tuple(f.cost for f in found)
     problem = build_problem(prepared.rig, prepared.features, model, prepared.nuisances, found[0].values)
-    again = Remembered(problem, _key(problem, used), cache, progress)
+    again = Remembered(problem, _key(problem), cache, progress)
     again.done, again.total, again.text = remembered.done, remembered.total, "noise estimated anew"
     best = fit(cast(Problem, again), model, coordinates, found[0].z, evaluations=evaluations)
     again.text = "tolerances of what is held"
@@ -675,12 +677,12 @@ def _of_the_recording(name: str) -> bool:
     return "@" in name or name.startswith(("log.", "control."))
 
 
-def _key(problem: Problem, used: Sequence[Mapping[str, Any]]) -> str:
+def _key(problem: Problem) -> str:
+    """What the residuals depend on beside the model and the parameters' values."""
     whitening = hashlib.sha256(
         b"".join(np.ascontiguousarray(lower).tobytes() for _, lower in problem.whitener)
     )
-    data = json.dumps([[d["sha256"], d["name"], d["closures"], d["signals"]] for d in used])
-    return code_digest(BAG_SOURCES) + data + whitening.hexdigest()
+    return code_digest(BAG_SOURCES) + content_hash(problem.features.trials) + whitening.hexdigest()
 
 
 def explaining(best: Fit, held: Sequence[Coordinate], by_held: Array) -> list[str]:
@@ -760,6 +762,8 @@ def command(
             "--prior", help="NAME=SD: prior standard deviation, of the logarithm for positive parameters."
         ),
     ] = None,
+    scale: Scale = None,
+    topics: Topics = None,
     starts: Annotated[int, typer.Option(min=1, help="Searches from different points.")] = 3,
     seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,
     cache: Annotated[
@@ -787,7 +791,7 @@ def command(
             raise HannesError(f"--prior {text}: '{name}' is not among --free.")
     with _Progress(quiet=json) as progress:
         progress(0, 1, "reading the bags")
-        prepared = _prepared(bags, model, None, None)
+        prepared = _prepared(bags, model, None, None, scale=scale, topics=topics)
         found = calibrate(
             prepared,
             names,

@@ -17,6 +17,7 @@ import numpy as np
 import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.signals import SIGNALS
 from hannes_sim.effect import effect_source, load_effect, strength_of
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -52,6 +53,13 @@ Scale = Annotated[
     typer.Option(
         "--scale",
         help="Factor of a signal to SI (rad at the pulley, A, V, N), as SIGNAL=FACTOR; 1 where the guess is wrong.",
+    ),
+]
+Topics = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--topic",
+        help="Topic that carries a signal, as SIGNAL=TOPIC, where the name does not say it; SIGNAL= leaves it out.",
     ),
 ]
 RigFile = Annotated[
@@ -134,6 +142,7 @@ def _prepared(
     rig: str | None = None,
     scale: Sequence[str] | None = None,
     threads: int = 1,
+    topics: Sequence[str] | None = None,
 ) -> Prepared:
     machine = load_rig(rig) if rig else None
     if machine is not None and model == "nominal":
@@ -147,7 +156,13 @@ def _prepared(
     factors = _factors(scale)
     if machine and factors:
         raise HannesError("--scale is for bags; with --rig the adapter's reader says what the units are.")
-    trials = machine.read(bags) if machine else load_trials(bags, scale=factors, objects=given)
+    if machine and topics:
+        raise HannesError("--topic is for bags; with --rig the adapter's reader says where the signals are.")
+    trials = (
+        machine.read(bags)
+        if machine
+        else load_trials(bags, scale=factors, objects=given, topics=_topics(topics))
+    )
     unknown = sorted(set(given).difference(*({t.name, *(part.name for part in t.parts)} for t in trials)))
     if unknown:
         raise HannesError(
@@ -175,6 +190,21 @@ def _factors(scale: Sequence[str] | None) -> dict[str, float]:
             raise HannesError(
                 f"--scale {text}: unknown signal; valid are {', '.join(('reference_position', *UNITS))}."
             )
+    return out
+
+
+def _topics(given: Sequence[str] | None) -> dict[str, str | None]:
+    """Topics by signal name; None leaves the signal out."""
+    out: dict[str, str | None] = {}
+    for text in given or ():
+        name, equals, topic = text.partition("=")
+        if not equals or name not in SIGNALS:
+            raise HannesError(
+                f"--topic {text}: give SIGNAL=TOPIC, or SIGNAL= to leave it out; signals are {', '.join(SIGNALS)}."
+            )
+        if name in out:
+            raise HannesError(f"--topic {text}: another topic is named for {name} already.")
+        out[name] = topic or None
     return out
 
 
@@ -231,13 +261,14 @@ def compare(
     ] = False,
     objects: Objects = None,
     scale: Scale = None,
+    topics: Topics = None,
     signals: Signals = None,
     rig: RigFile = None,
     report: ReportFile = None,
     json: Json = False,
 ) -> None:
     """Compare the model with recorded closures: where does it fail, and by how much?"""
-    prepared = _prepared(bags, model, objects, signals, rig, scale, _JOBS)
+    prepared = _prepared(bags, model, objects, signals, rig, scale, _JOBS, topics)
     result = compare_model(prepared, fitted=fitted)
     if report:
         _write_report(report, comparison=result, after=None, diagnosis=None)
@@ -301,6 +332,7 @@ def diagnose(
     out: Annotated[Path, typer.Option("--out", help="Model file that --add writes.")] = Path("my_hand.yaml"),
     objects: Objects = None,
     scale: Scale = None,
+    topics: Topics = None,
     signals: Signals = None,
     rig: RigFile = None,
     max_effects: MaxEffects = MAX_EFFECTS,
@@ -312,7 +344,7 @@ def diagnose(
     json: Json = False,
 ) -> None:
     """Which physical effect does the model lack: nothing, effects of the catalogue, or something unknown?"""
-    prepared = _prepared(bags, model, objects, signals, rig, scale, jobs)
+    prepared = _prepared(bags, model, objects, signals, rig, scale, jobs, topics)
     _check_effects(prepared, [*(only or ()), *(effects or ())])
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
         found = diagnose_model(
@@ -411,6 +443,7 @@ def add(
     out: Annotated[Path, typer.Option("--out", help="Model file to write.")] = Path("my_hand.yaml"),
     objects: Objects = None,
     scale: Scale = None,
+    topics: Topics = None,
     signals: Signals = None,
     rig: RigFile = None,
     jobs: Jobs = _JOBS,
@@ -420,7 +453,7 @@ def add(
     json: Json = False,
 ) -> None:
     """Add effects to the model, fit them, and show the error fall on held-out data."""
-    prepared = _prepared(bags, model, objects, signals, rig, scale, jobs)
+    prepared = _prepared(bags, model, objects, signals, rig, scale, jobs, topics)
     _check_effects(prepared, effects or ())
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
         found = add_effects(
@@ -535,6 +568,7 @@ def report(
     effects: Effects = None,
     objects: Objects = None,
     scale: Scale = None,
+    topics: Topics = None,
     signals: Signals = None,
     rig: RigFile = None,
     max_effects: MaxEffects = MAX_EFFECTS,
@@ -545,7 +579,7 @@ def report(
     json: Json = False,
 ) -> None:
     """Compare, diagnose and add, all on one self-contained HTML page."""
-    prepared = _prepared(bags, model, objects, signals, rig, scale, jobs)
+    prepared = _prepared(bags, model, objects, signals, rig, scale, jobs, topics)
     _check_effects(prepared, effects or ())
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
         found = diagnose_model(

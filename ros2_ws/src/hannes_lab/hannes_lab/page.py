@@ -26,7 +26,7 @@ import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 
-from .cli import _JOBS, Bags, Greedy, Jobs, MaxEffects, ModelFile, Objects, RigFile, Scale, Signals
+from .cli import _JOBS, Bags, Greedy, Jobs, MaxEffects, ModelFile, Objects, RigFile, Scale, Signals, Topics
 from .diagnose import MAX_EFFECTS
 from .page_guard import Guard, address_of
 from .page_worker import ANSWER, GRACE_S, MODEL, REPORT
@@ -321,6 +321,7 @@ def page(
     model: ModelFile = "nominal",
     objects: Objects = None,
     scale: Scale = None,
+    topics: Topics = None,
     signals: Signals = None,
     rig: RigFile = None,
     max_effects: MaxEffects = MAX_EFFECTS,
@@ -338,7 +339,7 @@ def page(
     if rig is None:
         Model.load(model)  # so that a wrong name is said here, not on the page
     settings: dict[str, Any] = {"bags": [str(b) for b in bags], "model": model, "rig": rig, "jobs": jobs}
-    settings |= {"objects": objects, "scale": scale, "signals": signals}
+    settings |= {"objects": objects, "scale": scale, "topics": topics, "signals": signals}
     settings |= {"max_effects": max_effects, "greedy": greedy}
     with tempfile.TemporaryDirectory(prefix="hannes_page_") as folder, listen(host, port) as listener:
         os.environ["NICEGUI_STORAGE_PATH"] = folder  # else NiceGUI would look for its own folder in this one

@@ -40,7 +40,14 @@ GRACE_S = 5.0
 EVERY_S = 0.1
 """Seconds between two lines of progress of the same text."""
 
-FIT = {"model": "model", "rig": "rig", "objects": "object", "scale": "scale", "signals": "signal"}
+FIT = {
+    "model": "model",
+    "rig": "rig",
+    "objects": "object",
+    "scale": "scale",
+    "topics": "topic",
+    "signals": "signal",
+}
 """What is asked of every command, and its option on the command line."""
 
 
@@ -100,8 +107,10 @@ def work(task: Mapping[str, Any], folder: Path, say: Say) -> None:
     progress = _Progress(say)
     say({"kind": "effects", "titles": {name: kind.title for name, kind in catalogue().items()}})
     progress(0, 1, "reading the bags")
-    objects, signals, rig, scale = (task.get(k) for k in ("objects", "signals", "rig", "scale"))
-    prepared = _prepared(task["bags"], task["model"], objects, signals, rig, scale, task["jobs"])
+    objects, signals, rig, scale, topics = (
+        task.get(k) for k in ("objects", "signals", "rig", "scale", "topics")
+    )
+    prepared = _prepared(task["bags"], task["model"], objects, signals, rig, scale, task["jobs"], topics)
     progress(1, 1, "reading the bags")
     notes = list(prepared.notes)
     say({"kind": "data", "data": data_used(prepared.features), "notes": notes, "model": prepared.model.name})

@@ -76,11 +76,13 @@ def load_trials(
     signals: Sequence[str] = SIGNALS,
     scale: Mapping[str, float] | None = None,
     objects: Mapping[str, str] | None = None,
+    topics: Mapping[str, str | None] | None = None,
 ) -> list[Trial]:
     """Trials of all bags below the paths; names are made unique.
 
     scale    factors to SI by signal name; other units and signs are guessed from all recordings together
     objects  what was grasped, by the name of the condition or of the bag
+    topics   by signal name, the topic that carries it in all bags; None leaves the signal out
     Bags of a few closures each that repeat one condition become one trial (join.py).  Bags without a whole closure, and
     those that are there already, are left out with a note.
     """
@@ -90,7 +92,7 @@ def load_trials(
     bags = find_bags(paths)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the reader's warnings are kept in the trial's notes
-        read = [compared(read_bag(bag), signals) for bag in bags]
+        read = [compared(read_bag(bag, topics=topics), signals) for bag in bags]
     for bag, recording in zip(bags, in_si(read, scale or {}), strict=True):
         try:
             trial = trial_of(recording)

@@ -294,14 +294,18 @@ def make_trial(
 
 def compared(recording: Recording, signals: Sequence[str] = SIGNALS) -> Recording:
     """The recording with nothing but its reference and what is compared of it."""
-    recording.require(["reference_position"])
+    if "reference_position" not in recording:
+        raise HannesError(
+            f"{recording.source} has no reference_position: it is needed, for the model replays it. "
+            + recording.elsewhere()
+        )
     present = [s for s in signals if s in recording.channels]
     if "motor_current" not in present and "motor_effort" in recording.channels:
         present.append("motor_effort")
     if not present:
         raise HannesError(
             f"{recording.source}: none of the signals {', '.join(signals)} is recorded; nothing can be "
-            "compared."
+            f"compared. {recording.elsewhere()}"
         )
     return replace(recording, channels={s: recording[s] for s in ("reference_position", *present)})
 
