@@ -1,10 +1,15 @@
 """The lab's commands as a user types them: output, files, JSON, exit codes."""
 
 import json
+import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hannes_description.model import Model
+from hannes_lab.cli import _relative_error
+from hannes_lab.compare import MetricRow
+from hannes_lab.diagnose import _failed
 from hannes_sim.effect import load_effect
 from lab.foreign_bags import hannes
 
@@ -24,6 +29,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_compare(bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     code, out, _ = hannes("compare", str(bags), capsys=capsys, monkeypatch=monkeypatch)
     assert code == 0 and "fails" in out and "times the repeatability" in out
+    assert "Relative error: (measured - model) / measured." in out
     code, out, _ = hannes("compare", str(bags), "--json", capsys=capsys, monkeypatch=monkeypatch)
     content = json.loads(out)
     assert code == 0 and content["overall"] > 2.0 and content["metrics"] and content["cells"]
@@ -157,6 +163,31 @@ def test_hide_refuses_what_would_hide_something_else(
     code, _, err = hannes("hide", *where, *words, capsys=capsys, monkeypatch=monkeypatch)
     assert code == 2 and said in " ".join(err.split())
     assert not (tmp_path / "truth.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("measured", "sd", "model", "said"),
+    [
+        (2.0, 0.1, 1.5, "25 %"),
+        (2.0, 0.1, 5.0, "-150 %"),
+        (0.02, 0.001, 1.18, "59 x too large"),
+        (-0.02, math.nan, 0.2, "10 x too large, other sign"),
+        (0.02, 0.03, 1.18, "-"),
+        (0.0, math.nan, 1.0, "-"),
+    ],
+)
+def test_a_relative_error_can_be_read(measured: float, sd: float, model: float, said: str) -> None:
+    percent = (measured - model) / measured * 100.0 if measured else math.nan
+    assert _relative_error(MetricRow("slow", "closure_time", "s", measured, sd, model, percent)) == said
+
+
+def test_simulations_that_failed_are_harmless_where_they_are_few() -> None:
+    counts = SimpleNamespace(failures=3, simulations=1000)
+    assert "3 of 1000 simulations" in _failed(counts)[0] and "harmless" in _failed(counts)[0]
+    counts.failures = 60
+    assert "harmless" not in _failed(counts)[0] and "above 5 %" in _failed(counts)[0]
+    counts.failures = 0
+    assert not _failed(counts)
 
 
 def test_effects_that_the_model_has_are_not_looked_for_in_silence(

@@ -81,6 +81,7 @@ def test_an_effect_that_acts_on_another_is_offered(prepared: Prepared) -> None:
     assert set(usable_effects(prepared, sources).sources) == set(sources)
     alone = usable_effects(prepared, effect_sources(only=["velocity_strengthening"]))
     assert not alone.sources and "velocity_strengthening would move none" in alone.notes[0]
+    assert alone.notes[0].endswith("on this machine and is not considered")
 
 
 def test_a_ripple_is_seen_in_the_spectrum_over_the_position(prepared: Prepared) -> None:

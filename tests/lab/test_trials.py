@@ -42,6 +42,18 @@ def test_two_speeds_in_one_bag_are_two_conditions() -> None:
     trial = make_trial(recording(reference, 250.0, metadata={"condition": "mix"}))
     assert len(trial.conditions) == 2
     assert sorted(len(trial.of(c)) for c in trial.conditions) == [3, 4]
+    assert any("2 conditions: mix.1 (3 closures), mix.2 (4 closures);" in note for note in trial.notes)
+
+
+def test_a_closure_that_was_broken_off_is_a_condition_of_its_own_and_said() -> None:
+    reference = half_sine(5)
+    k = int(np.argmax(reference > 0.5 * reference.max()))
+    reference[k : k + 3000] = 0.0
+    trial = make_trial(recording(reference, 250.0, metadata={"condition": "slow"}))
+    assert any(
+        "2 conditions: slow.1 (1 closure), slow.2 (4 closures); a closure that was broken off" in note
+        for note in trial.notes
+    ), trial.notes
 
 
 def test_a_cut_off_closure_is_left_out_and_said() -> None:

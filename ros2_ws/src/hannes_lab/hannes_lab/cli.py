@@ -25,7 +25,7 @@ from rich.table import Table
 
 from .add import Addition, add_effects, with_provenance
 from .cache import Store
-from .compare import Comparison
+from .compare import Comparison, MetricRow
 from .compare import compare as compare_model
 from .diagnose import MAX_EFFECTS, Diagnosis, effect_sources
 from .diagnose import diagnose as diagnose_model
@@ -94,6 +94,9 @@ NoCache = Annotated[
 ReportFile = Annotated[Path | None, typer.Option("--report", help="Write a self-contained HTML report here.")]
 
 _JOBS = max(1, os.cpu_count() or 1)
+
+MANY_TIMES = 5.0
+"""Model over measured value from which their ratio is shown instead of the relative error."""
 
 
 class _Progress:
@@ -310,9 +313,11 @@ def _show_comparison(result: Comparison) -> None:
             f"{_number(m.measured)} {m.unit}",
             _number(m.sd, 2),
             _number(m.model),
-            f"{_number(m.relative_error_percent, 3)} %",
+            _relative_error(m),
         )
     console.print(table)
+    if result.metrics:
+        console.print("Relative error: (measured - model) / measured.", style="dim")
     console.print(
         "The residual depends on: "
         + ", ".join(f"{d.variable} {100 * d.share:.0f} %" for d in result.depends_on)
@@ -320,6 +325,16 @@ def _show_comparison(result: Comparison) -> None:
     console.print(f"Overall error: {_number(result.overall)} times the repeatability between closures.")
     for note in result.notes:
         console.print(f"note: {note}", style="dim")
+
+
+def _relative_error(row: MetricRow) -> str:
+    """In percent, in words where the model is many times as large; unknown where the measured value may be zero."""
+    if not abs(row.measured) > (row.sd if math.isfinite(row.sd) else 0.0):
+        return "-"
+    ratio = row.model / row.measured
+    if abs(ratio) < MANY_TIMES:
+        return f"{_number(row.relative_error_percent, 3)} %"
+    return f"{abs(ratio):.2g} x too large" + (", other sign" if ratio < 0.0 else "")
 
 
 @interruptible

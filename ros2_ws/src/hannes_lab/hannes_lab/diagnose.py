@@ -78,6 +78,9 @@ NO_REPEATS = (
     "guess."
 )
 
+MANY_FAILURES = 0.05
+"""Part of the simulations that did not stay finite from which on their parameters are worth a look."""
+
 MAX_EFFECTS = 3
 
 WIDE = (4, 3)
@@ -672,11 +675,19 @@ def _nuisance_table(found: Fit) -> dict[str, dict[str, Any]]:
 
 
 def _failed(problem: Problem) -> list[str]:
-    """How many simulations did not stay finite; a fit takes them for very bad."""
+    """How many simulations did not stay finite, and whether that matters; a fit takes them for very bad."""
     if not problem.failures:
         return []
+    few = problem.failures < MANY_FAILURES * problem.simulations
+    meaning = (
+        "harmless: values that the search tried and left"
+        if few
+        else f"above {100 * MANY_FAILURES:.0f} % the search may have missed the best values: look at the model's "
+        "parameters and at effects of your own"
+    )
     return [
-        f"{problem.failures} of {problem.simulations} simulations did not stay finite and counted as very bad fits"
+        f"{problem.failures} of {problem.simulations} simulations did not stay finite and counted as very bad fits "
+        f"({meaning})"
     ]
 
 

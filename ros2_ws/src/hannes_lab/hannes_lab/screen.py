@@ -41,7 +41,8 @@ def usable_effects(prepared: Prepared, sources: Mapping[str, str]) -> Usable:
     silent = [name for name in offered if name not in moving]
     if silent:
         notes.append(
-            f"{', '.join(silent)} would move none of the compared signals on this machine and are not considered"
+            f"{', '.join(silent)} would move none of the compared signals on this machine and "
+            f"{'is' if len(silent) == 1 else 'are'} not considered"
         )
     return Usable({name: source for name, source in offered.items() if name in moving}, tuple(notes))
 

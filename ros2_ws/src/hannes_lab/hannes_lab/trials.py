@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -337,11 +338,21 @@ def trial_of(recording: Recording, *, name: str | None = None, period: float = 1
     inside = [(a, min(b, end)) for a, b in spans if a >= begin - 0.1 and min(b, end) > a]
     whole = [span for span in inside if not any(_gap(time, *span) for time, _ in samples.values())]
     if len(whole) < len(inside):
-        notes.append(f"{len(inside) - len(whole)} closures in which samples are missing are left out")
+        count = len(inside) - len(whole)
+        notes.append(
+            f"{_closures(count)} in which samples are missing {'is' if count == 1 else 'are'} left out"
+        )
     closures = group_closures(reference, period, whole, name, channel.period)
     cut = len(spans) - len(closures) - (len(inside) - len(whole))
     if cut:
-        notes.append(f"{cut} of {len(spans)} closures are cut off and left out")
+        notes.append(f"{cut} of {_closures(len(spans))} {'is' if cut == 1 else 'are'} cut off and left out")
+    kinds = Counter(closure.condition for closure in closures)
+    if len(kinds) > 1:
+        told = ", ".join(f"{kind} ({_closures(count)})" for kind, count in kinds.items())
+        notes.append(
+            f"the references of its closures differ, so they are {len(kinds)} conditions: {told}; a closure that was "
+            "broken off is one of its own"
+        )
     options = {key: meta[key] for key in ("object", "sensors", "plant", "pose") if key in meta}
     return Trial(
         name,
@@ -354,6 +365,10 @@ def trial_of(recording: Recording, *, name: str | None = None, period: float = 1
         recording.sha256,
         tuple(notes),
     )
+
+
+def _closures(count: int) -> str:
+    return f"{count} closure{'s' * (count != 1)}"
 
 
 def _gap(time: Array, start: float, stop: float) -> bool:
