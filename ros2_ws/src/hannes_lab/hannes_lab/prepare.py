@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ import numpy as np
 from hannes_bags.reading import read_bag
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from scipy.special import ndtr
 
 from .features import Features, build_features
 from .fit import fit
@@ -26,6 +28,10 @@ from .units import in_si
 
 OUTLIER = 6.0
 """A closure whose distance from the median closure exceeds this multiple of the median distance is left out."""
+
+
+DRIFT = 1e-4
+"""Chance of a trend below which closures are said to drift."""
 
 
 @dataclass(frozen=True)
@@ -196,9 +202,39 @@ def prepare(
         where = [trial.name for trial in trials if signal in trial.signals]
         if len(where) < len(trials):
             notes.append(f"{signal} is recorded only in {', '.join(where)}")
+    notes += drifts(features)
     few = [c for c in features.conditions if all(b.n < 5 for b in features.blocks if b.condition == c)]
     if few:
         notes.append(
             f"fewer than five closures of {', '.join(few)}: the repeatability is a guess from the priors"
         )
     return Prepared(rig, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))
+
+
+def drifts(features: Features) -> list[str]:
+    """A sentence for each condition whose closures change steadily from the first to the last.
+
+    Mann-Kendall test of a signal's closures along their first principal component: scatter is by chance from closure to
+    closure, a drift is not.  Fewer than ten cannot show it.
+    """
+    out = []
+    for condition in features.conditions:
+        drifting = {}
+        for block in features.blocks:
+            if block.condition != condition or block.n < 3:
+                continue
+            away = block.measured - block.measured.mean(axis=0)
+            scores, sizes, _ = np.linalg.svd(away, full_matrices=False)
+            rising = int(np.sign(scores[None, :, 0] - scores[:, None, 0])[np.triu_indices(block.n, 1)].sum())
+            sd = math.sqrt(block.n * (block.n - 1) * (2 * block.n + 5) / 18.0)
+            if 2.0 * ndtr((1 - abs(rising)) / sd) < DRIFT:
+                drifting[block.signal] = 100.0 * float((sizes[0] / np.linalg.norm(sizes)) ** 2)
+        if drifting:
+            shares = ", ".join(
+                f"{share:.0f} % of the scatter of {signal}" for signal, share in drifting.items()
+            )
+            out.append(
+                f"{condition}: the closures drift from the first to the last ({shares}), which the repeatability holds "
+                "as if it were chance: let the hand warm up or run in, then record again"
+            )
+    return out

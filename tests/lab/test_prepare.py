@@ -1,0 +1,22 @@
+"""What is said of a set before anything is fitted."""
+
+from dataclasses import replace
+
+from hannes_description.model import Model
+from hannes_lab.features import build_features
+from hannes_lab.hide import make_set
+from hannes_lab.prepare import drifts
+from hannes_lab.trials import make_trial
+
+
+def test_closures_that_drift_are_said_to() -> None:
+    """A friction that wears off: each closure asks for a little less current than the one before."""
+    recordings, _ = make_set(Model.load(), [], seed=5, closures=12, conditions=("fast", "slow"))
+    trials = [make_trial(r) for r in recordings]
+    assert drifts(build_features(trials, ["motor_current"])) == []
+    fast = trials[0]
+    time, current = fast.signals["motor_current"]
+    less = (time, current * (1.0 - 0.2 * time / time[-1]))
+    worn = replace(fast, signals={**fast.signals, "motor_current": less})
+    (said,) = drifts(build_features([worn, trials[1]], ["motor_current"]))
+    assert said.startswith("fast: the closures drift") and "of the scatter of motor_current" in said
