@@ -38,11 +38,6 @@ RISE = (0.3, 0.8)
 """Parts of the excess between which its slope is taken."""
 
 
-OWN_RISE = 0.5
-"""Part of the excess that must come from the recording's own rising current: a fast hand that brakes needs less current
-than a slow one at the same place, and nothing was grasped."""
-
-
 def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
     """The trials, with an object of roughly seen stiffness and place where nobody said what was grasped.
 
@@ -152,7 +147,8 @@ def _seen(
     for other in others:
         if other is None or other[0][-1] < q[peak]:
             continue
-        there = np.interp(q, *other)
+        # Where it brakes before it arrives, its current says less than what moves the hand.
+        there = np.maximum(np.interp(q, *other), np.median(other[1]))
         if factor > EXCESS[0] or there[peak] < base[peak]:
             factor, base = EXCESS[0], there
     if current[peak] < factor * base[peak] + EXCESS[1]:
@@ -160,10 +156,7 @@ def _seen(
     excess = np.maximum.accumulate(np.maximum(current - base, 0.0)[: peak + 1])
     first, last = (int(np.searchsorted(excess, part * excess[-1])) for part in RISE)
     run = max(float(q[last] - q[first]), 1e-3)
-    rise = float(excess[last] - excess[first])
-    if current[last] - current[first] < OWN_RISE * rise:
-        return None
-    slope = max(rise, 1e-6) / run
+    slope = max(float(excess[last] - excess[first]), 1e-6) / run
     place = float(q[first]) - float(excess[first]) / slope
     if slope * per_ampere < STIFFER * rate or place < FREE_TRAVEL * q[-1]:
         return None
