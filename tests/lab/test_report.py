@@ -355,6 +355,14 @@ def test_no_excess_is_not_shared_out() -> None:
     assert "99.9" not in page.words
 
 
+def test_an_effect_that_is_found_within_chance_has_its_share() -> None:
+    diagnosis = make_diagnosis("effects")
+    diagnosis["costs"] |= {"nominal_fitted": 0.7 * diagnosis["costs"]["critical"]}
+    page = page_of(comparison=None, diagnosis=diagnosis)
+    assert "There is no excess to explain" not in page.words
+    assert "the effect that was found gains more than chance does" in page.words and "99.9" in page.words
+
+
 def test_experiments_that_separate_nothing_are_called_so() -> None:
     diagnosis = make_diagnosis("effects")
     diagnosis["experiments"][0]["distance"] = 0.1
