@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hannes_bags.reading import read_bag
 from hannes_description.model import Model
-from hannes_lab.diagnose import Diagnosis, diagnose, effect_sources
+from hannes_lab.chance import chance
+from hannes_lab.diagnose import Diagnosis, _adequate, _short_of, diagnose, effect_sources
+from hannes_lab.executor import Executor
 from hannes_lab.grasp import _seen, with_seen_objects
 from hannes_lab.hand import outer_loop
 from hannes_lab.prepare import load_trials, prepare
+from hannes_lab.search import Candidate, Search
 from hannes_lab.trials import Trial
 from hannes_sim.effect import strength_of
 from lab.foreign_bags import Signals, signals_of_set, write_set
@@ -81,3 +85,23 @@ def test_a_slow_closure_on_nothing_is_no_grasp_where_the_fast_one_brakes() -> No
     assert _seen((q, slow), [(q, braking)], nominal) is None
     assert _seen((q, gripping), [(q, braking)], nominal) is not None
     assert _seen((q, gripping), [(q, slow)], nominal) is not None
+
+
+def test_one_hand_whose_zero_is_elsewhere_in_each_recording_explains_nothing(tmp_path: Path) -> None:
+    prepared = prepare(strange_set(tmp_path), Model.load())
+    sources = effect_sources(only=FEW, model=prepared.model)
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, sources, executor=Executor(1))
+    null = search.null()
+    limits = chance(search.problem, null.fit, search.signatures(null))
+    zeros = [k for k, c in enumerate(null.fit.coordinates) if c.name.startswith("encoder.zero@")]
+
+    def moved(by: list[float]) -> Candidate:
+        z = null.fit.z.copy()
+        z[zeros] += by
+        return replace(null, fit=replace(null.fit, z=z))
+
+    assert len(zeros) == 3 and _adequate(search, null, limits)
+    assert _adequate(search, moved([15.0, 15.0, 15.0]), limits)
+    assert not _adequate(search, moved([0.0, 0.0, 15.0]), limits)
+    said = _short_of(search, moved([0.0, 0.0, 15.0]), limits)
+    assert said == "encoder.zero differs between recordings of one hand by 10 times its tolerance"

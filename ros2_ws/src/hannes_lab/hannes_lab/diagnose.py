@@ -53,10 +53,6 @@ OWN_ERROR_MOST = 2.4
 square.  A large error in few is lost in the sum over all: then what is left is not the model's form, but something
 that is missing."""
 
-SPREAD_MOST = 8.0
-"""Standard deviations by which a parameter of single recordings (encoder zero, clock) may differ from its mean over all
-of them.  One hand whose open position is elsewhere in each recording is no explanation, however well it fits."""
-
 TIE = 6.0
 """Sets whose penalised costs differ by less cannot be told apart: a likelihood ratio of e^3 = 20.  The best is the
 wrong one beyond it in 0.7 % at worst, of sets that are as far apart as that (normal tail at the root of 6)."""
@@ -422,7 +418,7 @@ def _ended_early(size: int, left: float, best: Candidate, limits: Chance) -> str
 
 def _adequate(search: Search, candidate: Candidate, limits: Chance, room: float = ADEQUATE) -> bool:
     """Whether chance, with the model's own error if it has one, explains what a set leaves."""
-    if _spread(candidate)[1] > SPREAD_MOST:
+    if _apart(search, candidate):
         return False
     if search.problem.discrepancy:
         return candidate.fit.cost <= limits.misfit and _worst(search, candidate)[1] <= OWN_ERROR_MOST
@@ -436,18 +432,20 @@ def _worst(search: Search, candidate: Candidate) -> tuple[str, float]:
     return (f"{block.signal} of '{block.condition}'" if block else "", error)
 
 
-def _spread(candidate: Candidate) -> tuple[str, float]:
-    """The parameter of single recordings that differs most between them, and by how many of its standard deviations.
-
-    Those of an object are left out: each recording may have its own.
-    """
-    families: dict[str, list[float]] = {}
-    for c, z in zip(candidate.fit.coordinates, candidate.fit.z, strict=True):
-        family, of_one, _ = c.name.partition("@")
-        if of_one and c.prior and not family.startswith("object."):
-            families.setdefault(family, []).append(float(z))
-    spreads = {name: max(abs(z - sum(zs) / len(zs)) for z in zs) for name, zs in families.items()}
-    return max(spreads.items(), key=lambda item: item[1], default=("", 0.0))
+def _apart(search: Search, candidate: Candidate) -> str:
+    """The parameter of single recordings that differs more between them than it may, in words; empty if none does."""
+    families: dict[str, list[tuple[float, float]]] = {}
+    for nuisance in search.nuisances:
+        family, of_one, _ = nuisance.name.partition("@")
+        z = candidate.fit.z_of(nuisance.name)
+        if of_one and z is not None:
+            families.setdefault(family, []).append((z, nuisance.apart))
+    for family, own in families.items():
+        mean = sum(z for z, _ in own) / len(own)
+        farthest = max(abs(z - mean) for z, _ in own)
+        if any(abs(z - mean) > most for z, most in own):
+            return f"{family} differs between recordings of one hand by {farthest:.0f} times its tolerance"
+    return ""
 
 
 def _tie(search: Search) -> float:
@@ -799,8 +797,7 @@ def _short_of(search: Search, best: Candidate, limits: Chance) -> str:
     """In what a set that is not adequate falls short."""
     if best.fit.cost > limits.misfit:
         return f"misfit {best.fit.cost:.0f} stays above what chance reaches ({limits.misfit:.0f})"
-    name, spread = _spread(best)
-    if spread > SPREAD_MOST:
-        return f"{name} differs between recordings of one hand by {spread:.0f} times its tolerance"
+    if apart := _apart(search, best):
+        return apart
     where, error = _worst(search, best)
     return f"error in {where} is {error:.1f} times as large as a model of this form is allowed to be off"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -51,6 +52,10 @@ _UNKNOWN_ZERO_SD = 0.1
 _WIRE = "wire.stiffness"
 _UNKNOWN_WIRE_SD = 0.5
 """Width of its prior (of the logarithm): nobody measured it, and on an unknown object it counts with the object's."""
+
+_APART = 8.0
+"""Standard deviations from the mean over the recordings: one hand whose open position, or clock, is elsewhere in each
+recording is no explanation, however well it fits."""
 
 REFERENCE_DELAY = "log.reference_delay"
 REFERENCE_DELAY_SD = 0.02
@@ -182,6 +187,7 @@ class HandRig(PlantRig):
                         scatter,
                         "rad",
                         step=0.5 if is_described(trial) else WIDE_STEP,
+                        apart=math.inf if is_described(trial) else _APART,
                     )
                     for trial in self.trials
                 ]
@@ -218,8 +224,8 @@ class HandRig(PlantRig):
             step = float(np.median(np.diff(logged[0])))
             out.append(Nuisance(CURRENT_WINDOW, 0.5 * step, 1.0, True, unit="s"))
         out += [
-            Nuisance(f"{REFERENCE_DELAY}@{trial.name}", delay, REFERENCE_DELAY_SD, False, unit="s")
-            for trial in strange
+            Nuisance(f"{REFERENCE_DELAY}@{t.name}", delay, REFERENCE_DELAY_SD, False, unit="s", apart=_APART)
+            for t in strange
         ]
         return out
 

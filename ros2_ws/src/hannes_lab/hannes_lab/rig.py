@@ -59,6 +59,8 @@ class Nuisance:
     closure_sd   scatter from closure to closure, same scale as sd
     step         of finite differences, in sd: small where the prior is wide
     lower        least value, for a positive parameter on a linear scale
+    apart        sd that the one of a recording may be from the mean over all recordings; beyond, no set of effects is
+                 adequate
     """
 
     name: str
@@ -69,6 +71,7 @@ class Nuisance:
     unit: str = ""
     step: float = 0.5
     lower: float = -math.inf
+    apart: float = math.inf
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.sd) and self.sd > 0.0):
