@@ -51,6 +51,15 @@ def signals_of_set(
     }
 
 
+def scaled(**factors: float) -> Damage:
+    """Signals in other units or with the other sign."""
+
+    def damage(signals: Signals) -> Signals:
+        return {n: (t, v * factors.get(n, 1.0)) for n, (t, v) in signals.items()}
+
+    return damage
+
+
 def write_bag(
     folder: Path,
     signals: Signals,

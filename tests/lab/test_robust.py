@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hannes_description.joints import RAD_PER_COUNT
-from lab.foreign_bags import Damage, Signals, hannes_in_one_line, signals_of_set, write_bag, write_set
+from lab.foreign_bags import Damage, Signals, hannes_in_one_line, scaled, signals_of_set, write_bag, write_set
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 
@@ -20,13 +20,6 @@ def good() -> dict[str, Signals]:
 @pytest.fixture(scope="module")
 def slow(good: dict[str, Signals]) -> dict[str, Signals]:
     return {"slow": good["slow"]}
-
-
-def scaled(**factors: float) -> Damage:
-    def damage(signals: Signals) -> Signals:
-        return {n: (t, v * factors.get(n, 1.0)) for n, (t, v) in signals.items()}
-
-    return damage
 
 
 def cut(begin: float, end: float, *only: str) -> Damage:

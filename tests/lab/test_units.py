@@ -14,7 +14,7 @@ from hannes_description.errors import HannesError
 from hannes_lab.prepare import load_trials
 from hannes_lab.trials import Trial, make_trial
 from hannes_lab.units import in_si
-from lab.foreign_bags import Damage, Signals, hannes_in_one_line, signals_of_set, write_set
+from lab.foreign_bags import Signals, hannes_in_one_line, scaled, signals_of_set, write_set
 
 FREE, BLOCKED = 13.0, 4.0
 
@@ -220,15 +220,9 @@ def bench() -> dict[str, Signals]:
     return signals_of_set(sensors="bench", conditions=("slow", "fast", "grasp"), closures=3)
 
 
-def scaled_current(factor: float) -> Damage:
-    return lambda signals: {
-        n: (t, v * factor if n == "motor_current" else v) for n, (t, v) in signals.items()
-    }
-
-
 def test_bags_of_one_command_get_one_sign(bench: dict[str, Signals], tmp_path: Path) -> None:
     plain = load_trials([write_set(tmp_path / "plain", bench)])
-    turned = load_trials([write_set(tmp_path / "turned", bench, scaled_current(-1.0))])
+    turned = load_trials([write_set(tmp_path / "turned", bench, scaled(motor_current=-1.0))])
     for one, other in zip(plain, turned, strict=True):
         assert values(one, "motor_current") == pytest.approx(values(other, "motor_current"))
         assert any("its sign was turned" in note for note in other.notes)
@@ -240,7 +234,7 @@ def test_the_command_refuses_hundredths_of_an_ampere_in_one_line(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    bags = str(write_set(tmp_path / "bags", bench, scaled_current(100.0)))
+    bags = str(write_set(tmp_path / "bags", bench, scaled(motor_current=100.0)))
     code, _, err = hannes_in_one_line("compare", bags, capsys=capsys, monkeypatch=monkeypatch)
     assert code == 2 and "too much for A" in err and len(err.strip().splitlines()) == 1
     words = ("compare", bags, "--scale", "motor_current=0.01")

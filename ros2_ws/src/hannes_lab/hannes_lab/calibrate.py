@@ -39,7 +39,7 @@ from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
 from .cache import content_hash
-from .cli import Scale, Topics
+from .cli import Scale, Topics, _command, _console, _number, _prepared, _print_json, _Progress
 from .errors import held_out_closures, overall, signal_errors
 from .executor import interruptible
 from .features import data_used
@@ -773,8 +773,6 @@ def command(
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
 ) -> None:
     """Identify named parameters of your hand from recorded closures, with intervals and warnings."""
-    from .cli import _command, _console, _number, _prepared, _print_json, _Progress
-
     names = [n.strip() for n in free.split(",") if n.strip()]
     if out.suffix not in (".yaml", ".yml"):
         raise HannesError(f"--out {out}: a model file ends in .yaml.")

@@ -83,7 +83,7 @@ def separating_experiments(
     out = []
     for name, profile, options, grasp in CANDIDATES:
         trial = _trial(prepared.features.trials[0], name, profile, options, grasp)
-        rig = type(prepared.rig)([trial])  # type: ignore[call-arg]
+        rig = type(prepared.rig)([trial])  # type: ignore[call-arg]  # the protocol has no constructor
         open_ = [_open(rig, c) for c in tied]
         predictions = [_predict(rig, c, trial, noise, o) for c, o in zip(tied, open_, strict=True)]
         sensitivity = _sensitivity(rig, tied[0], trial, noise, open_[0], predictions[0])
