@@ -13,6 +13,7 @@ from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.problem import nuisance_coordinate
 from hannes_lab.search import Search
+from hannes_lab.settle import _sloped
 from hannes_lab.surrogate import AnchoredRig, repeated, rig_for
 from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import strength_of
@@ -56,6 +57,33 @@ def test_slopes_of_the_slow_plant_make_it_right_around_the_anchor(rig, trial):
     bare = AnchoredRig(rig.exact, FULL, {})
     wrong = np.linalg.norm(simulated(bare, trial, values) - true)
     assert np.linalg.norm(simulated(rig, trial, values) - true) < 0.5 * wrong
+
+
+def test_a_move_teaches_the_slopes_what_they_missed(rig, trial):
+    here = {"hand.stiffness": 1.1 * FULL.parameters.value("hand.stiffness")}
+    there = {"hand.stiffness": 1.5 * FULL.parameters.value("hand.stiffness")}
+    before, after = rig.anchored(FULL, here), rig.anchored(FULL, there)
+    true = simulated(rig.exact, trial, here)
+    assert not np.allclose(simulated(after, trial, here), true, atol=1e-6)
+    taught = after.taught(before, {"hand.stiffness": 1.0})
+    np.testing.assert_allclose(simulated(taught, trial, here), true, atol=1e-9)
+    np.testing.assert_allclose(
+        simulated(taught, trial, there), simulated(rig.exact, trial, there), atol=1e-12
+    )
+
+
+def test_a_slope_beside_which_the_slow_plant_diverges_is_left_out_and_counted(trial):
+    recordings, _ = make_set(Model.load(), [], seed=31, closures=3, conditions=("fast",))
+    prepared = prepare([make_trial(recordings[0])], FULL, surrogate=True)
+    search = Search(prepared.problem, FULL, prepared.nuisances, {})
+    null = search.null().fit
+    c = next(c for c in null.coordinates if c.name == "hand.stiffness")
+    wild = replace(c, scale=1e6, upper=np.inf)
+    strange = replace(null, coordinates=tuple(wild if one is c else one for one in null.coordinates))
+    failures = search.problem.failures
+    problem = _sloped(search.problem, strange, afresh=True)
+    assert problem.failures == failures + 1
+    assert problem.rig is search.problem.rig
 
 
 @pytest.mark.parametrize("model", [FULL, Model.load()], ids=lambda m: m.plant)

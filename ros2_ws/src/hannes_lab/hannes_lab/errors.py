@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .features import Block, Features
 from .fit import fit
 from .problem import Coordinate, Problem
+from .surrogate import anchored_at
 
 Array = NDArray[np.float64]
 
@@ -134,9 +135,10 @@ def held_out_closures(
     train, test = split_closures(features)
     problem: Problem = problem_of(train)
     found = fit(problem, model, coordinates, start, evaluations=6)
+    rig = anchored_at(problem.rig, model, found.values)
     floor = [repeatability(block) for block in features.blocks]
-    inside = signal_errors(train, train.closures(problem.rig, model, found.values), floor)
-    outside = signal_errors(test, test.closures(problem.rig, model, found.values), floor)
+    inside = signal_errors(train, train.closures(rig, model, found.values), floor)
+    outside = signal_errors(test, test.closures(rig, model, found.values), floor)
     return overall(inside), overall(outside)
 
 
@@ -179,7 +181,8 @@ def held_out_condition_errors(
         if own:
             local = Fixed(problem, {n: v for n, v in values.items() if n not in {c.name for c in own}})
             values = {**values, **fit(local, model, own, {}, rows=rows, evaluations=6).values}
-        errors = signal_errors(features, features.closures(problem.rig, model, values))
+        rig = anchored_at(problem.rig, model, values)
+        errors = signal_errors(features, features.closures(rig, model, values))
         out[condition] = tuple(e for e in errors if e.condition == condition)
     return out
 

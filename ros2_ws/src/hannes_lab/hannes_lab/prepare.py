@@ -185,7 +185,7 @@ def prepare(
     view = rig_for(rig, model, coordinates, threads) if surrogate else rig
     problem = build_problem(view, features, model, nuisances, {})
     found = fit(problem, model, coordinates, {}, evaluations=15)
-    settled, found = settle(problem, found)
+    settled, found = settle(problem, found, moves=3)
     problem = build_problem(settled.rig, features, model, nuisances, found.values, problem.counts)
     notes = [f"{trial.name}: {note}" for trial in trials for note in trial.notes]
     if len(features.conditions) < 2:

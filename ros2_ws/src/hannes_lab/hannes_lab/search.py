@@ -31,11 +31,12 @@ from .problem import (
 from .rig import Nuisance
 from .scan import Scan, Scored, farthest, point_key
 from .settle import at_anchor, seen_from, settle, slopes_at
-from .surrogate import AnchoredRig
+from .surrogate import AnchoredRig, anchored_at
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 Names = tuple[str, ...]
+_Approached = tuple[Any, str, list[Any], list[Fit]]
 
 
 @dataclass(frozen=True)
@@ -65,11 +66,11 @@ RIVAL_START = 2.0
 HOPELESS = 10.0
 """Sets whose cost is so many times that of the best are not followed; on a slow plant, by the scan already."""
 
-AHEAD = 2
-"""Approaches to a slow plant that are carried on to it first; what they reach tells which others are hopeless."""
-
 REMOVED = 0.3
 """An approach that removes this part of its base's cost is never called hopeless: the way on may be long."""
+
+ALIKE = 0.5
+"""Part of the gain of an approach that led to a set which explains all; approaches of less are not carried on."""
 
 PULLED = 4.0
 """Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are approached: it may
@@ -91,7 +92,7 @@ class Search:
     """Fits of effect sets on one problem; each set is fitted once.
 
     sources     effect name -> what load_effect takes (catalogue name or path.py:Class)
-    base        effects that the given model has already; their parameters stay as they are
+    before      the model as it is, fitted with the noise that was estimated before; where its fit starts from
     """
 
     problem: Problem
@@ -101,6 +102,7 @@ class Search:
     executor: Executor = field(default_factory=Executor)
     progress: Progress = silent
     rows: NDArray[np.bool_] | None = None
+    before: Candidate | None = None
     found: dict[Names, Candidate] = field(default_factory=dict)
     _nominal: dict[bytes, Fit] = field(default_factory=dict)
     _key: str = ""
@@ -121,12 +123,15 @@ class Search:
     def null(self) -> Candidate:
         """The model as it is, with its nuisance parameters fitted."""
         if () not in self.found:
-            self.found[()] = self.once(Search._null, text="nominal: fit")
+            if self.before is None:
+                self.found[()] = self.once(Search._null, text="nominal: fit")
+            else:
+                self.found[()] = self.once(Search._refit, self.before, 25, text="nominal: fit")
         return self.found[()]
 
     def _null(self) -> Candidate:
         found = fit(self.problem, self.model, self.coordinates, {}, rows=self.rows, evaluations=25)
-        best = settle(self.problem, found, self.rows)[1]
+        best = settle(self.problem, found, self.rows, afresh=True)[1]
         return Candidate((), best, best.cost)
 
     def with_effects(self, names: Names) -> tuple[Model, tuple[Coordinate, ...]]:
@@ -174,9 +179,10 @@ class Search:
             near = self.scan.nearer(start, base.fit)
             at = self.scan.true_start(base.fit, model, coordinates, start)
             if self.slow:
-                one = fit(
-                    seen_from(self.problem, near), model, coordinates, at, rows=self.rows, evaluations=15
-                )
+                # Seen from elsewhere, a strong effect fits where the slow plant says nothing of the kind.
+                values = {c.name: c.value(at.get(c.name, 0.0)) for c in coordinates}
+                there = self.problem.with_rig(anchored_at(self.problem.rig, model, values))
+                one = fit(there, model, coordinates, at, rows=self.rows, evaluations=15)
                 # Costs that were seen from different places cannot be compared before the anchor is there.
                 found.append(at_anchor(self.problem, one, self.rows)[1])
                 continue
@@ -210,12 +216,16 @@ class Search:
         approaches: Sequence[Fit],
         worth: float = np.inf,
         short: bool = False,
+        whole: bool = True,
     ) -> Candidate:
-        """The best that the approaches lead to: the first, and others that cost about as little."""
-        best = self._carried_on(approaches[0], worth, short)
+        """The best that the approaches lead to: the first, and others that cost about as little.
+
+        whole   on a slow plant, carry them on to the end
+        """
+        best = self._carried_on(approaches[0], worth, short, whole)
         for other in approaches[1:]:
             if other.cost <= RIVAL_START * (approaches[0] if short else best).cost:
-                best = min(best, self._carried_on(other, worth, short), key=lambda f: f.cost)
+                best = min(best, self._carried_on(other, worth, short, whole), key=lambda f: f.cost)
         if best.cost > base.fit.cost:
             # The set contains the base: the search was led astray, and starts again from where the base is.
             strengths = {f"{name}.{p.name}" for p in self.effect(name).parameters if p.vanishing is not None}
@@ -230,11 +240,11 @@ class Search:
                 evaluations=LONG,
                 worth=worth - _penalty(best.coordinates),
             )
-            best = min(best, self._carried_on(again, worth), key=lambda f: f.cost)
+            best = min(best, self._carried_on(again, worth, whole=whole), key=lambda f: f.cost)
         return _candidate((*base.names, name), best)
 
-    def _carried_on(self, found: Fit, worth: float, short: bool = False) -> Fit:
-        """An approach carried on: a short one to its end, and to a slow plant in a few moves."""
+    def _carried_on(self, found: Fit, worth: float, short: bool = False, whole: bool = True) -> Fit:
+        """An approach carried on: a short one to its end; on a slow plant to its end (whole) or in a few moves."""
         if short and found.complete:
             return fit(
                 self.problem,
@@ -246,7 +256,9 @@ class Search:
                 evaluations=LONG,
                 worth=worth - _penalty(found.coordinates),
             )
-        return settle(self.problem, found, self.rows, moves=2, renew=False)[1]
+        if whole:
+            return settle(self.problem, found, self.rows, afresh=True)[1]
+        return settle(self.problem, found, self.rows, moves=2)[1]
 
     def _known(self, candidate: Candidate) -> Candidate:
         if candidate.fit.complete:
@@ -266,9 +278,11 @@ class Search:
         return candidate
 
     def _again(self, old: Fit, evaluations: int) -> Fit:
-        """A fit from where another ended, carried on to the slow plant itself where there is one."""
-        found = fit(
-            seen_from(self.problem, old),
+        """A fit from where another ended; on a slow plant with its slopes there, as those of elsewhere mislead."""
+        if self.slow:
+            return settle(self.problem, old, self.rows, afresh=True)[1]
+        return fit(
+            self.problem,
             old.model,
             old.coordinates,
             old.z,
@@ -276,7 +290,6 @@ class Search:
             steps=spread(old),
             evaluations=evaluations,
         )
-        return settle(self.problem, found, self.rows)[1]
 
     def with_spread(self, candidate: Candidate) -> Candidate:
         """The candidate with the derivatives from which its intervals are made."""
@@ -293,9 +306,7 @@ class Search:
         problem = build_problem(
             rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values, self.problem.counts
         )
-        return Search(
-            problem, self.model, self.nuisances, self.sources, self.executor, self.progress, self.rows
-        )
+        return replace(self, problem=problem, before=self.null(), found={}, _nominal={}, _key="")
 
     def _refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
         """A candidate of another problem (other noise), fitted in this one from its point."""
@@ -354,20 +365,23 @@ class Search:
                 else k < REFIT or base.pulled
             )
         ]
-        refitted = [self._known(c) for c in self._refits(chosen, text, worth)]
-        ranked = sorted(refitted, key=lambda c: c.penalised)
-        worthy = [(c,) for c in ranked[:POLISH] if c.penalised < worth]
-        if self.slow and worthy:
-            # There polishing is long, and tells between sets that are close.
-            close = [(c,) for (c,) in worthy if c.penalised <= HOPELESS * ranked[0].penalised]
-            worthy = close if len(close) > 1 else []
-        polished = [self._known(c) for c in self.each(Search._polish, worthy, f"{text}: polish")]
-        return sorted([*polished, *ranked[len(polished) :]], key=lambda c: c.penalised)
+        ended, others = self._refits(chosen, text, worth)
+        ranked = sorted((self._known(c) for c in (*ended, *others)), key=lambda c: c.penalised)
+        # On a slow plant polishing is long, and the best are polished already.
+        most = min(worth, HOPELESS * ranked[0].penalised) if self.slow and ranked else worth
+        done = {c.names for c in ended}
+        worthy = [c for c in ranked[:POLISH] if c.penalised < most and c.names not in done]
+        polished = self.each(Search._polish, [(c,) for c in worthy], f"{text}: polish")
+        better = {c.names: self._known(c) for c in polished}
+        return sorted((better.get(c.names, c) for c in ranked), key=lambda c: c.penalised)
 
     def _refits(
         self, chosen: Sequence[tuple[Candidate, str, list[Any]]], text: str, worth: float
-    ) -> list[Candidate]:
-        """Fits in closed loop: all are approached, and those that this does not leave hopeless are carried on."""
+    ) -> tuple[list[Candidate], list[Candidate]]:
+        """Fits in closed loop: all are approached, and those that this does not leave hopeless are carried on.
+
+        Those of a slow plant that were carried on to the end, and the others.
+        """
         short = not self.slow and len(chosen) > REFIT
         found = self.each(Search._approaches, [(*item, worth, short) for item in chosen], f"{text}: approach")
         items = [(*item, fits) for item, fits in zip(chosen, found, strict=True)]
@@ -378,21 +392,31 @@ class Search:
             )
             rest = items[REFIT:]
             ended = [_candidate((*b.names, n), replace(fits[0], complete=False)) for b, n, _, fits in rest]
-            return [*done, *ended]
+            return [], [*done, *ended]
         # A further effect that gains nothing where its fit ends is near to where it would settle.
         items = [
             item
             for item in items
             if not item[0].names or _candidate(item[0].names, item[3][0]).penalised < item[0].penalised
         ]
-        done = self.each(Search._settled, items[:AHEAD], f"{text}: refit")
-        least = min((c.fit.cost for c in done), default=np.inf)
-        rest = [
+        # The best goes first, to the end: what it reaches tells which others are hopeless.
+        done = self.each(Search._settled, [(*item, worth) for item in items[:1]], f"{text}: refit")
+        followed = [(*item, worth, False, False) for item in self._followed(items, done)]
+        return done, self.each(Search._settled, followed, f"{text}: refit")
+
+    def _followed(self, items: Sequence[_Approached], done: Sequence[Candidate]) -> list[_Approached]:
+        """Which approaches to a slow plant are carried on after the first one, by what that reached."""
+        if not done:
+            return []
+        least = done[0].fit.cost
+        gains = [base.fit.cost - fits[0].cost for base, _, _, fits in items]
+        # Where it explains all, others can only tie with it: they move the data alike, and so do their approaches.
+        asked = ALIKE * gains[0] if least <= self.problem.features.size else -np.inf
+        return [
             item
-            for item in items[AHEAD:]
-            if item[3][0].cost <= max(HOPELESS * least, (1.0 - REMOVED) * item[0].fit.cost)
+            for item, gain in zip(items[1:], gains[1:], strict=True)
+            if gain >= asked and item[3][0].cost <= max(HOPELESS * least, (1.0 - REMOVED) * item[0].fit.cost)
         ]
-        return [*done, *self.each(Search._settled, rest, f"{text}: refit")]
 
     @staticmethod
     def _promising(rank: int, scanned: float, least: float, worth: float) -> bool:

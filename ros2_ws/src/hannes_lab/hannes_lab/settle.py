@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
 from .fit import Fit, fit, prior_weights, spread
@@ -12,13 +13,13 @@ from .problem import Problem
 from .rig import Rig
 from .surrogate import AnchoredRig, anchored_at
 
-MOVES = 6
+MOVES = 12
 """How often the anchor moves at most."""
 
 SETTLED = 1.0
-"""The anchor stays where a further move lowers the cost by less than this, or by less than LITTLE of it."""
-
-LITTLE = 0.002
+LITTLE = 0.005
+"""The anchor stays where a further move lowers the cost by less than SETTLED, or by less than this part of what noise
+does not explain."""
 
 
 def seen_from(problem: Problem, found: Fit) -> Problem:
@@ -42,34 +43,40 @@ def settle(
     rows: NDArray[np.bool_] | None = None,
     *,
     moves: int = MOVES,
-    renew: bool = True,
+    afresh: bool = False,
 ) -> tuple[Problem, Fit]:
     """Fit, move the anchor to where the fit ends, and again until it stays there.
 
     Where the plant is fast already, nothing happens.  The returned problem is anchored at the returned fit.
 
-    renew   take all slopes of the slow plant afresh, once, where a move does not lead down
+    afresh  take all slopes of the slow plant where the fit is; otherwise only those that were not taken elsewhere
     """
     if not isinstance(problem.rig, AnchoredRig):
         return problem, found
     problem, best = at_anchor(problem, found, rows)
-    problem = _sloped(problem, best, anew=False)
-    renewed = not renew
+    problem = _sloped(problem, best, afresh)
+    used = best.residual.size if rows is None else int(rows.sum())
+    astray = not afresh
     for _ in range(moves):
         new = fit(
             problem, best.model, best.coordinates, best.z, rows=rows, steps=spread(best), evaluations=15
         )
-        least = max(SETTLED, LITTLE * best.cost)
+        least = max(SETTLED, LITTLE * (best.cost - used))
         if best.cost - new.cost < least:
             break
+        failures = problem.failures
         there, new = at_anchor(problem, new, rows)
+        if problem.failures > failures:
+            break
+        there = _taught(there, problem, new)
         gain = best.cost - new.cost
         if gain > 0.0:
             problem, best = there, new
-        if gain < least:
-            if renewed:
-                break
-            problem, renewed = _sloped(problem, best, anew=True), True
+        else:
+            problem = problem.with_rig(_anchored(problem).with_slopes_of(_anchored(there)))
+        if gain < least and astray:
+            break
+        astray = gain < least
     return problem, best
 
 
@@ -81,9 +88,25 @@ def slopes_at(rig: Rig, found: Fit) -> Rig:
     return rig.sloped([c for c in found.coordinates if not c.prior])
 
 
-def _sloped(problem: Problem, found: Fit, anew: bool) -> Problem:
-    rig = problem.rig
-    assert isinstance(rig, AnchoredRig)
-    todo = [c for c in found.coordinates if anew or not c.prior or c.name not in rig.slopes]
+def _sloped(problem: Problem, found: Fit, afresh: bool) -> Problem:
+    """The problem with the slow plant's slopes at its anchor; as it was where the slow plant diverges beside it."""
+    rig = _anchored(problem)
+    todo = [c for c in found.coordinates if afresh or c.name not in rig.slopes]
     problem.counts.simulations += len(todo)
-    return problem.with_rig(rig.sloped(todo))
+    try:
+        return problem.with_rig(rig.sloped(todo))
+    except PlantDiverged:
+        problem.counts.failures += 1
+        return problem
+
+
+def _taught(there: Problem, before: Problem, found: Fit) -> Problem:
+    """The problem at its new anchor, with what the move from the one before says of the slopes."""
+    squares = (found.jacobian**2).sum(axis=0)
+    weights = {c.name: float(w) for c, w in zip(found.coordinates, squares, strict=True)}
+    return there.with_rig(_anchored(there).taught(_anchored(before), weights))
+
+
+def _anchored(problem: Problem) -> AnchoredRig:
+    assert isinstance(problem.rig, AnchoredRig)
+    return problem.rig

@@ -5,7 +5,8 @@
 At the anchor a this is the slow plant exactly.  Its slopes are the slow plant's too for every coordinate whose
 difference of slopes was taken (space mapping that is consistent to first order: Alexandrov, Lewis 2001; Bandler et al.
 2004); for the others the fast plant's count.  A fit moves the anchor to where it ends and goes on until it stays
-there, so that what is reported at the end was simulated on the slow plant.
+there, so that what is reported at the end was simulated on the slow plant.  Each move teaches the slopes: they are
+changed as little as agrees with the slow plant at both ends of the move (Broyden 1965).
 """
 
 from __future__ import annotations
@@ -89,6 +90,36 @@ class AnchoredRig:
         """The same with the slow plant's slopes at the anchor for these coordinates."""
         slopes = dict(zip((c.name for c in coordinates), self._new_slopes(coordinates), strict=True))
         return self._like(self._model, self._values, {**self._slopes, **slopes})
+
+    def taught(self, before: AnchoredRig, weights: Mapping[str, float]) -> AnchoredRig:
+        """The same with slopes that agree with the anchor before too: what they miss between the two is given to them.
+
+        weights  share of a coordinate by name, per squared distance in z: those that move the data most miss most
+        """
+        moved = {
+            name: slope.away(self._values[name], before._values)
+            for name, slope in self._slopes.items()
+            if weights.get(name)
+        }
+        signals = {name: dict(slope.signals) for name, slope in self._slopes.items()}
+        for trial in self.trials:
+            own = [name for name in moved if trial.name in signals[name]]
+            whole = sum(weights[name] * moved[name] ** 2 for name in own)
+            if whole > 0.0:
+                n = signals[own[0]][trial.name].shape[1]
+                missed = self._correction(trial, trial.reference, n)
+                missed = missed - before._correction(trial, trial.reference, n)
+                for name in own:
+                    missed = missed - moved[name] * signals[name][trial.name]
+                for name in own:
+                    share = weights[name] * moved[name] / whole
+                    signals[name][trial.name] = signals[name][trial.name] + share * missed
+        slopes = {name: _Slope(slope.coordinate, signals[name]) for name, slope in self._slopes.items()}
+        return self._like(self._model, self._values, slopes)
+
+    def with_slopes_of(self, other: AnchoredRig) -> AnchoredRig:
+        """The same with the slopes of another."""
+        return self._like(self._model, self._values, other._slopes)
 
     def _like(self, model: Model, values: Mapping[str, float], slopes: Mapping[str, _Slope]) -> AnchoredRig:
         made = AnchoredRig(self.exact, model, values, slopes, self._corrections, self.threads, self._ends)
