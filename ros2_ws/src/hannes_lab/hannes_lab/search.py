@@ -179,10 +179,14 @@ class Search:
             near = self.scan.nearer(start, base.fit)
             at = self.scan.true_start(base.fit, model, coordinates, start)
             if self.slow:
-                # Seen from elsewhere, a strong effect fits where the slow plant says nothing of the kind.
-                values = {c.name: c.value(at.get(c.name, 0.0)) for c in coordinates}
-                there = self.problem.with_rig(anchored_at(self.problem.rig, model, values))
-                one = fit(there, model, coordinates, at, rows=self.rows, evaluations=15)
+                one = fit(
+                    self._seen_from_start(model, coordinates, at, near),
+                    model,
+                    coordinates,
+                    at,
+                    rows=self.rows,
+                    evaluations=15,
+                )
                 # Costs that were seen from different places cannot be compared before the anchor is there.
                 found.append(at_anchor(self.problem, one, self.rows)[1])
                 continue
@@ -207,6 +211,19 @@ class Search:
                     )
                 )
         return sorted(found, key=lambda f: f.cost)
+
+    def _seen_from_start(
+        self, model: Model, coordinates: Sequence[Coordinate], at: Mapping[str, float], near: Fit
+    ) -> Problem:
+        """The problem seen from where a fit starts, or from the fit near it where the slow plant diverges at the start.
+
+        Seen from elsewhere, a strong effect fits where the slow plant says nothing of the kind.
+        """
+        values = {c.name: c.value(at.get(c.name, 0.0)) for c in coordinates}
+        there = self.problem.with_rig(anchored_at(self.problem.rig, model, values))
+        failures = there.failures
+        there.residual(model, values)
+        return there if there.failures == failures else seen_from(self.problem, near)
 
     def _settled(
         self,
@@ -306,7 +323,9 @@ class Search:
         problem = build_problem(
             rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values, self.problem.counts
         )
-        return replace(self, problem=problem, before=self.null(), found={}, _nominal={}, _key="")
+        return replace(
+            self, problem=problem, before=self.found.get((), self.before), found={}, _nominal={}, _key=""
+        )
 
     def _refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
         """A candidate of another problem (other noise), fitted in this one from its point."""

@@ -55,13 +55,13 @@ def settle(
         return problem, found
     problem, best = at_anchor(problem, found, rows)
     problem = _sloped(problem, best, afresh)
-    used = best.residual.size if rows is None else int(rows.sum())
+    samples = best.residual.size if rows is None else int(rows.sum())
     astray = not afresh
     for _ in range(moves):
         new = fit(
             problem, best.model, best.coordinates, best.z, rows=rows, steps=spread(best), evaluations=15
         )
-        least = max(SETTLED, LITTLE * (best.cost - used))
+        least = max(SETTLED, LITTLE * (best.cost - samples))
         if best.cost - new.cost < least:
             break
         failures = problem.failures
