@@ -72,18 +72,22 @@ def test_a_move_teaches_the_slopes_what_they_missed(rig, trial):
     )
 
 
-def test_a_slope_beside_which_the_slow_plant_diverges_is_left_out_and_counted(trial):
-    recordings, _ = make_set(Model.load(), [], seed=31, closures=3, conditions=("fast",))
-    prepared = prepare([make_trial(recordings[0])], FULL, surrogate=True)
+def test_where_the_slow_plant_diverges_slopes_are_left_out_and_starts_are_seen_from_the_fit(trial):
+    prepared = prepare([trial], FULL, surrogate=True)
     search = Search(prepared.problem, FULL, prepared.nuisances, {})
     null = search.null().fit
     c = next(c for c in null.coordinates if c.name == "hand.stiffness")
     wild = replace(c, scale=1e6, upper=np.inf)
-    strange = replace(null, coordinates=tuple(wild if one is c else one for one in null.coordinates))
+    coordinates = tuple(wild if one is c else one for one in null.coordinates)
     failures = search.problem.failures
-    problem = _sloped(search.problem, strange, afresh=True)
+    problem = _sloped(search.problem, replace(null, coordinates=coordinates), afresh=True)
     assert problem.failures == failures + 1
     assert problem.rig is search.problem.rig
+    seen = search._seen_from_start(FULL, coordinates, {"hand.stiffness": 1.0}, null)
+    np.testing.assert_allclose(seen.residual(null.model, null.values), null.residual, atol=1e-9)
+    assert seen.failures == failures + 2
+    near = search._seen_from_start(FULL, null.coordinates, null.point, null)
+    assert near.failures == failures + 2
 
 
 @pytest.mark.parametrize("model", [FULL, Model.load()], ids=lambda m: m.plant)
