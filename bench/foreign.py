@@ -5,7 +5,8 @@ without metadata: nothing says how they were logged, what was grasped, or which 
 diagnosed with the nominal model.  Every result is kept in a file named by its content and the sources' hash, so
 that an interrupted run goes on where it stopped.  `--tuning` takes other seeds and strengths, for setting thresholds.
 `--full-hand` takes closures of the full hand in MuJoCo instead, without what describes them: a third simulator to the
-reduced plant, on which no threshold was set.
+reduced plant, on which no threshold was set.  `--lugre` takes the hand of `bench/lugre_hand.py`, with another friction,
+another controller and another move; no threshold was set on it either.
 """
 
 from __future__ import annotations
@@ -34,8 +35,9 @@ from rosbags.typesys import Stores, get_typestore
 
 sys.path.insert(0, str(Path(__file__).parent))
 import identification
+import lugre_hand
+import other_hand
 from identification import kept, source_hash
-from other_hand import TICK, Hand, closures
 
 SPREAD = {
     "resistance": 0.025, "kt": 0.015, "friction": 0.05, "viscous": 0.05, "preload": 0.025, "spring": 0.025,
@@ -86,7 +88,7 @@ HIDDEN: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...]], ...] =
 )
 """What is hidden, as the catalogue calls it if it does, the log, and values of Hand (`viscous` as a factor)."""
 
-OUTSIDE = ("a worn spot", "quadratic drag")
+OUTSIDE = ("a worn spot", "quadratic drag", "hysteresis", "a shaking mount")
 RELATIVE = ("viscous",)
 
 CLEAN: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = (
@@ -109,6 +111,22 @@ DESCRIBES = ("sensors", "plant")
 """What says how a recording was made."""
 
 
+LUGRE: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...]], ...] = (
+    ((), "30 Hz rectified", ()),
+    ((), "50 Hz", ()),
+    ((), "100 Hz", (("current_kp", 0.12), ("current_ki", 1100.0))),
+    (("viscous_friction",), "50 Hz", (("viscous", 4.0),)),
+    (("load_dependent_friction",), "100 Hz", (("capstan", 0.2),)),
+    (("glove_stiffness",), "50 Hz", (("glove", 4e-4),)),
+    (("wire_slack",), "100 Hz", (("slack", 0.9),)),
+    (("gear_backlash",), "100 Hz", (("backlash", 0.4),)),
+    (("hysteresis",), "100 Hz", (("hysteresis", 0.03),)),
+    (("quadratic drag",), "100 Hz", (("drag", 2.5e-4),)),
+    (("a shaking mount",), "100 Hz", (("shaking", 0.02),)),
+)
+"""What is hidden in the hand of bristles, the log, and values of its Hand."""
+
+
 @dataclass(frozen=True)
 class Case:
     """One set of recordings: slow and fast closures on nothing, slow ones on an object."""
@@ -119,17 +137,24 @@ class Case:
     seed: int
     grasp: str = "rigid"
     repeats: int = 13
+    lugre: bool = False
 
     @property
     def key(self) -> str:
         here = Path(__file__).parent
-        sources = [source_hash(), *((here / f).read_text() for f in ("foreign.py", "other_hand.py"))]
+        files = ("foreign.py", "other_hand.py", "lugre_hand.py")
+        sources = [source_hash(), *((here / f).read_text() for f in files)]
         return hashlib.sha256(json.dumps([asdict(self), sources]).encode()).hexdigest()[:20]
 
 
 def full_hand_cases() -> list[Case]:
     """The sets of the full hand."""
     return [Case(hidden, FULL_LOG, (), 900 + k) for k, hidden in enumerate(FULL_HAND)]
+
+
+def lugre_cases() -> list[Case]:
+    """The sets of the hand of bristles."""
+    return [Case(*what, 500 + k, lugre=True) for k, what in enumerate(LUGRE)]
 
 
 def cases(tuning: bool) -> list[Case]:
@@ -157,14 +182,14 @@ def _stronger(name: str, value: float, factor: float) -> float:
 def record(case: Case, folder: Path) -> None:
     """The set as bags."""
     rng = np.random.default_rng(case.seed)
-    base = Hand()
+    simulator: Any = lugre_hand if case.lugre else other_hand
+    base = simulator.Hand()
     base = base._replace(
         **{n: getattr(base, n) * math.exp(sd * rng.standard_normal()) for n, sd in SPREAD.items()}
     )
     base = base._replace(**{n: v * getattr(base, n) if n in RELATIVE else v for n, v in case.changes})
     for name, period, grasp in (("slow", 4.0, ""), ("fast", 2.0, ""), ("grasp", 4.0, case.grasp)):
-        t = np.arange(round(period / TICK)) * TICK
-        reference = np.maximum(0.0, 13.0 * np.sin(2.0 * np.pi * t / period))
+        reference = simulator.reference(period)
         hand = base
         if grasp:
             k, at, damping = OBJECTS[grasp]
@@ -177,31 +202,32 @@ def record(case: Case, folder: Path) -> None:
                 moved["object_stiffness"] = hand.object_stiffness * math.exp(0.02 * rng.standard_normal())
                 moved["object_at"] = hand.object_at + 0.03 * rng.standard_normal()
             hands.append(hand._replace(**moved))
-        signals = closures(hands, reference)
-        _write(
-            folder / name,
-            np.concatenate([np.zeros(700), *([reference] * case.repeats)]),
-            signals,
-            case.log,
-            rng,
-        )
+        signals = simulator.closures(hands, reference)
+        rest = np.zeros(signals.shape[0] - case.repeats * reference.size)
+        commanded = np.concatenate([rest, *([reference] * case.repeats)])
+        _write(folder / name, commanded, signals, simulator.TICK, case.log, rng)
 
 
 def _write(
-    folder: Path, reference: np.ndarray, signals: np.ndarray, log: str, rng: np.random.Generator
+    folder: Path,
+    reference: np.ndarray,
+    signals: np.ndarray,
+    period: float,
+    log: str,
+    rng: np.random.Generator,
 ) -> None:
     rate, window, rectified, reference_rate = LOGS[log]
-    width = round(window / TICK)
+    width = round(window / period)
     current = np.abs(signals[:, 1]) if rectified else signals[:, 1]
     total = np.concatenate([np.zeros(width), np.cumsum(current)])
     current = (total[width:] - total[:-width]) / width
-    at = np.arange(int(reference.size * TICK * rate)) / rate + 3e-4
-    tick = np.minimum((at / TICK).astype(int), reference.size - 1)
+    at = np.arange(int(reference.size * period * rate)) / rate + 3e-4
+    tick = np.minimum((at / period).astype(int), reference.size - 1)
     amperes = current[tick] + 0.005 * rng.standard_normal(tick.size)
     amperes = np.abs(amperes) if rectified else amperes
     stamps = at + np.abs(rng.normal(0.0, 1e-3, at.size))
-    told = np.arange(int(reference.size * TICK * reference_rate)) / reference_rate
-    values = reference[(told / TICK + 1e-6).astype(int)]
+    told = np.arange(int(reference.size * period * reference_rate)) / reference_rate
+    values = reference[(told / period + 1e-6).astype(int)]
     events = [(float(a), 0, float(v)) for a, v in zip(told, values, strict=True)]
     events += [(float(a), 1, float(v)) for a, v in zip(stamps, signals[tick, 0], strict=True)]
     events += [(float(a), 2, float(v)) for a, v in zip(stamps, amperes, strict=True)]
@@ -267,10 +293,13 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--tuning", action="store_true", help="other seeds and strengths")
     parser.add_argument("--full-hand", action="store_true", help="closures of the full hand, undescribed")
+    parser.add_argument("--lugre", action="store_true", help="the hand of bristles instead of the other one")
     parser.add_argument("--out", type=Path, default=Path("out/foreign"), help="folder of the kept results")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    todo = full_hand_cases() if options.full_hand else cases(options.tuning)
+    todo = cases(options.tuning)
+    if options.full_hand or options.lugre:
+        todo = full_hand_cases() if options.full_hand else lugre_cases()
     runs = Parallel(n_jobs=options.jobs, return_as="generator")(
         delayed(kept)(run_case, c, options.out / f"{c.key}.json") for c in todo
     )

@@ -70,6 +70,12 @@ class Hand(NamedTuple):
     drag: float = 0.0
 
 
+def reference(period: float) -> Array:
+    """Target angle (ticks,) rad of one closure: the upper half of a sine, and a rest."""
+    t = np.arange(round(period / TICK)) * TICK
+    return np.maximum(0.0, 13.0 * np.sin(2.0 * np.pi * t / period))
+
+
 @njit(cache=False)
 def _rates(s: Any, u: float, h: Any) -> Any:
     """Of motor angle, speed, load angle, speed, current."""
@@ -124,7 +130,7 @@ def simulate(reference: Any, h: Any, s: Any, c: Any, out: Any) -> None:
 def closures(hands: list[Hand], reference: Array) -> Array:
     """Angle, current, voltage (n, 3) of one closure after another, each by its hand, after 0.7 s of rest."""
     state, memory, parts = np.zeros(5), np.zeros(4), []
-    for one, hand in ((np.zeros(700), hands[0]), *((reference, hand) for hand in hands)):
+    for one, hand in ((np.zeros(round(0.7 / TICK)), hands[0]), *((reference, hand) for hand in hands)):
         out = np.zeros((one.size, 3))
         simulate(one, hand, state, memory, out)
         parts.append(out)
