@@ -6,7 +6,7 @@ diagnosed with the nominal model.  Every result is kept in a file named by its c
 that an interrupted run goes on where it stopped.  `--tuning` takes other seeds and strengths, for setting thresholds.
 `--full-hand` takes closures of the full hand in MuJoCo instead, without what describes them: a third simulator to the
 reduced plant, on which no threshold was set.  `--lugre` takes the hand of `bench/lugre_hand.py`, with another friction,
-another controller and another move; no threshold was set on it either.
+other gains and another move; no threshold was set on it either.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class Case:
     @property
     def key(self) -> str:
         here = Path(__file__).parent
-        files = ("foreign.py", "other_hand.py", "lugre_hand.py")
+        files = ("foreign.py", "hand_parts.py", "lugre_hand.py", "other_hand.py")
         sources = [source_hash(), *((here / f).read_text() for f in files)]
         return hashlib.sha256(json.dumps([asdict(self), sources]).encode()).hexdigest()[:20]
 
@@ -291,15 +291,16 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--tuning", action="store_true", help="other seeds and strengths")
-    parser.add_argument("--full-hand", action="store_true", help="closures of the full hand, undescribed")
-    parser.add_argument("--lugre", action="store_true", help="the hand of bristles instead of the other one")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--tuning", action="store_true", help="other seeds and strengths")
+    which.add_argument("--full-hand", action="store_true", help="closures of the full hand, undescribed")
+    which.add_argument("--lugre", action="store_true", help="the hand of bristles instead of the other one")
     parser.add_argument("--out", type=Path, default=Path("out/foreign"), help="folder of the kept results")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    todo = cases(options.tuning)
-    if options.full_hand or options.lugre:
-        todo = full_hand_cases() if options.full_hand else lugre_cases()
+    todo = (
+        full_hand_cases() if options.full_hand else lugre_cases() if options.lugre else cases(options.tuning)
+    )
     runs = Parallel(n_jobs=options.jobs, return_as="generator")(
         delayed(kept)(run_case, c, options.out / f"{c.key}.json") for c in todo
     )

@@ -11,6 +11,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from hand_parts import command, held, played
 from numba import njit
 from numpy.typing import NDArray
 
@@ -91,13 +92,7 @@ def _rates(s: Any, u: float, h: Any) -> Any:
     drive += -h.drag * v * abs(v) - h.ripple * math.sin(h.waves * q) - tension
     pull = tension - h.preload - h.spring * ql - h.load_friction * math.tanh(vl / (2.0 * h.blur))
     pull -= h.glove * max(ql, 0.0) ** h.glove_power
-    depth = ql - h.object_at
-    if depth > 0.0:
-        pull -= max(0.0, h.object_stiffness * depth * (1.0 + h.object_damping * vl))
-    if ql < 0.0:
-        pull -= h.stop * ql + 0.002 * vl
-    if ql > h.travel:
-        pull -= h.stop * (ql - h.travel) + 0.002 * vl
+    pull = held(pull, ql, vl, h)
     back = h.kt * h.ratio * v
     motor = drive / (h.rotor * h.ratio * h.ratio)
     return np.array([v, motor, vl, pull / h.load, (u - h.resistance * i - back) / h.inductance])
@@ -109,18 +104,11 @@ def simulate(reference: Any, h: Any, s: Any, c: Any, out: Any) -> None:
 
     out   (n, 3): encoder angle, measured current, voltage
     """
-    a, dt = math.exp(-TICK / h.velocity_filter), TICK / STEPS
+    dt = TICK / STEPS
     for k in range(reference.size):
         position = math.floor((s[0] + h.zero) / COUNT) * COUNT
         current = s[4] * h.current_gain
-        if c[3] == 0.0:
-            c[1], c[3] = position, 1.0
-        c[2] = a * c[2] + (1.0 - a) * (position - c[1]) / TICK
-        c[1] = position
-        wanted = h.kp * (reference[k] - position) - h.kd * c[2]
-        error = min(max(wanted, -h.current_max), h.current_max) - current
-        c[0] = min(max(c[0] + h.current_ki * TICK * error, -h.voltage_max), h.voltage_max)
-        u = min(max(h.current_kp * error + c[0], -h.voltage_max), h.voltage_max)
+        u = command(reference[k], position, current, h, TICK, c)
         out[k, 0], out[k, 1], out[k, 2] = position, current, u
         for _ in range(STEPS):
             middle = s + 0.5 * dt * _rates(s, u, h)
@@ -129,9 +117,4 @@ def simulate(reference: Any, h: Any, s: Any, c: Any, out: Any) -> None:
 
 def closures(hands: list[Hand], reference: Array) -> Array:
     """Angle, current, voltage (n, 3) of one closure after another, each by its hand, after 0.7 s of rest."""
-    state, memory, parts = np.zeros(5), np.zeros(4), []
-    for one, hand in ((np.zeros(round(0.7 / TICK)), hands[0]), *((reference, hand) for hand in hands)):
-        out = np.zeros((one.size, 3))
-        simulate(one, hand, state, memory, out)
-        parts.append(out)
-    return np.concatenate(parts)
+    return played(simulate, 5, 4, TICK, hands, reference)

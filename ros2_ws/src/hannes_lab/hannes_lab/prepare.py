@@ -185,6 +185,7 @@ def prepare(
     view = rig_for(rig, model, coordinates, threads) if surrogate else rig
     problem = build_problem(view, features, model, nuisances, {})
     found = fit(problem, model, coordinates, {}, evaluations=15)
+    # Near is enough for the noise; the search fits the model as it is again, to the end.
     settled, found = settle(problem, found, moves=3)
     problem = build_problem(settled.rig, features, model, nuisances, found.values, problem.counts)
     notes = [f"{trial.name}: {note}" for trial in trials for note in trial.notes]
