@@ -67,7 +67,9 @@ FURTHER = 1.5
 """Where all is explained within chance, a further effect must gain so many times what chance gains."""
 
 FAR = 3.0
-"""Standard deviations of its prior at which a nominal parameter is called far off."""
+IMPLAUSIBLE = 8.0
+"""Standard deviations of its prior at which a nominal parameter is called far off, and beyond which no set of effects
+that needs it there is adequate: an effect may fit well whose only merit is that it replaces what the model had."""
 
 NO_REPEATS = (
     "There is one closure of each condition only: nothing could be held out, and how well the hand repeats itself is a "
@@ -418,7 +420,7 @@ def _ended_early(size: int, left: float, best: Candidate, limits: Chance) -> str
 
 def _adequate(search: Search, candidate: Candidate, limits: Chance, room: float = ADEQUATE) -> bool:
     """Whether chance, with the model's own error if it has one, explains what a set leaves."""
-    if _apart(search, candidate):
+    if _apart(search, candidate) or _implausible(candidate):
         return False
     if search.problem.discrepancy:
         return candidate.fit.cost <= limits.misfit and _worst(search, candidate)[1] <= OWN_ERROR_MOST
@@ -446,6 +448,22 @@ def _apart(search: Search, candidate: Candidate) -> str:
         if any(abs(z - mean) > most for z, most in own):
             return f"{family} differs between recordings of one hand by {farthest:.0f} times its tolerance"
     return ""
+
+
+def _implausible(candidate: Candidate) -> str:
+    """The well-known parameter that is farther off than IMPLAUSIBLE, in words; empty if none is."""
+    far = [
+        (abs(float(z)), c)
+        for c, z in zip(candidate.fit.coordinates, candidate.fit.z, strict=True)
+        if c.prior and not c.wide and "@" not in c.name
+    ]
+    off, c = max(far, key=lambda item: item[0], default=(0.0, None))
+    if c is None or off <= IMPLAUSIBLE:
+        return ""
+    return (
+        f"{c.name} would be {candidate.fit.values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g}, {off:.0f} times "
+        "its tolerance off: if the nominal model is not that of this machine, calibrate it first"
+    )
 
 
 def _tie(search: Search) -> float:
@@ -797,7 +815,7 @@ def _short_of(search: Search, best: Candidate, limits: Chance) -> str:
     """In what a set that is not adequate falls short."""
     if best.fit.cost > limits.misfit:
         return f"misfit {best.fit.cost:.0f} stays above what chance reaches ({limits.misfit:.0f})"
-    if apart := _apart(search, best):
-        return apart
+    if off := _apart(search, best) or _implausible(best):
+        return off
     where, error = _worst(search, best)
     return f"error in {where} is {error:.1f} times as large as a model of this form is allowed to be off"

@@ -60,6 +60,11 @@ class Coordinate:
     step: float
     unit: str = ""
 
+    @property
+    def wide(self) -> bool:
+        """True for a nuisance parameter with a wide prior: its step, in standard deviations, is a small one."""
+        return self.prior and self.step < Nuisance.step
+
     def value(self, z: float) -> float:
         # A step of the search may go to where no number is; the bounds bring it back.
         raw = self.offset * math.exp(min(self.scale * z, 700.0)) if self.log else self.offset + self.scale * z

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from hannes_description.model import Model
-from hannes_sim.effect import EffectType
+from hannes_sim.effect import EffectParameter, EffectType
 from numpy.typing import NDArray
 
 from .fit import Fit, finite_differences, linear_minimum, prior_weights
 from .problem import Coordinate, Problem, effect_coordinates
 from .settle import seen_from
-from .spectrum import position_periods
+from .spectrum import long_periods, position_periods
 
 Array = NDArray[np.float64]
 Point = dict[str, float]
@@ -218,13 +218,20 @@ def _grid(kind: EffectType, problem: Problem, base: Fit) -> tuple[list[Point], d
     shapes, strengths = [], {}
     for c, p in zip(effect_coordinates(kind), kind.parameters, strict=True):
         if p.vanishing is None:
-            found = position_periods(problem, base, p.lower, p.upper) if p.period else ()
+            found = _periods(problem, base, p) if p.period else ()
             shapes.append([(c.name, c.z(v)) for v in (*(p.starts or (p.typical,)), *found)])
         else:
             low, high = c.bounds
             points = [c.z(v) for v in p.starts] or [z for s in STRENGTHS for z in (s, -s)]
             strengths[c.name] = [z for z in points if low <= z <= high]
     return [dict(shape) for shape in itertools.product(*shapes)], strengths
+
+
+def _periods(problem: Problem, base: Fit, p: EffectParameter) -> tuple[float, ...]:
+    return (
+        *position_periods(problem, base, p.lower, p.upper),
+        *long_periods(problem, p.lower, p.upper),
+    )
 
 
 def farthest(found: Fit) -> float:

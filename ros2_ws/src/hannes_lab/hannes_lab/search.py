@@ -30,7 +30,7 @@ from .problem import (
 )
 from .rig import Nuisance
 from .scan import Scan, Scored, farthest, point_key
-from .settle import at_anchor, seen_from, settle, slopes_at
+from .settle import MOVES, at_anchor, least_gain, seen_from, settle, slopes_at
 from .surrogate import AnchoredRig, anchored_at
 
 Array = NDArray[np.float64]
@@ -58,7 +58,14 @@ REFIT = 8
 
 SHORT = 4
 LONG = 10
-"""Steps of a fit in closed loop; of the first one where more than REFIT extensions are to be told apart."""
+WHOLE = 25
+"""Steps of a fit in closed loop: where more than REFIT extensions are to be told apart, of the others, and of the model
+as it is."""
+
+STARTS = 5
+APART = 1.5
+"""Further starts of the fit of the model as it is, and how far off, in standard deviations of the priors, where these
+are wide: the misfit of a closed loop whose gains, wire and object are not known has several minima."""
 
 RIVAL_START = 2.0
 """A second start of a fit is carried on if it costs less than so many times what the first reached."""
@@ -123,16 +130,34 @@ class Search:
     def null(self) -> Candidate:
         """The model as it is, with its nuisance parameters fitted."""
         if () not in self.found:
-            if self.before is None:
-                self.found[()] = self.once(Search._null, text="nominal: fit")
-            else:
-                self.found[()] = self.once(Search._refit, self.before, 25, text="nominal: fit")
+            best = self.once(Search._ended, self._begun(), text="nominal: fit")
+            self.found[()] = Candidate((), best, best.cost)
         return self.found[()]
 
-    def _null(self) -> Candidate:
-        found = fit(self.problem, self.model, self.coordinates, {}, rows=self.rows, evaluations=25)
-        best = settle(self.problem, found, self.rows, afresh=True)[1]
-        return Candidate((), best, best.cost)
+    def _begun(self) -> Fit:
+        """The fit of the model as it is with the noise that was estimated before, or the best from several starts."""
+        if self.before is not None:
+            return self.before.fit
+        starts = wide_starts(self.coordinates)
+        return min(
+            self.each(Search._begin, [(start,) for start in starts], "nominal: fit"), key=lambda f: f.cost
+        )
+
+    def _begin(self, start: Mapping[str, float]) -> Fit:
+        return fit(self.problem, self.model, self.coordinates, start, rows=self.rows, evaluations=WHOLE)
+
+    def _ended(self, found: Fit) -> Fit:
+        """A fit carried on until it stays."""
+        found = at_anchor(self.problem, found, self.rows)[1]
+        samples = self.problem.features.size if self.rows is None else int(self.rows.sum())
+        for _ in range(1 if self.slow else MOVES):
+            new = self._again(found, WHOLE)
+            gain = found.cost - new.cost
+            if gain > 0.0:
+                found = new
+            if gain < least_gain(found.cost, samples):
+                break
+        return found
 
     def with_effects(self, names: Names) -> tuple[Model, tuple[Coordinate, ...]]:
         """The model with the effects switched off but movable, and the coordinates to move."""
@@ -571,3 +596,10 @@ def _penalty(coordinates: Sequence[Coordinate]) -> float:
 def _derivatives(found: Fit, of: Sequence[Coordinate] | None = None) -> dict[str, Array]:
     """Derivatives (size,) at a fit by coordinate name; of all its coordinates if not of some."""
     return {c.name: found.jacobian[:, j] for j, c in enumerate(found.coordinates) if of is None or c in of}
+
+
+def wide_starts(coordinates: Sequence[Coordinate]) -> list[dict[str, float]]:
+    """Where fits of the model as it is start: the nominal values, and others if some priors are wide."""
+    wide = [c.name for c in coordinates if c.wide]
+    others = np.random.default_rng(0).uniform(-APART, APART, (STARTS if wide else 0, len(wide)))
+    return [{}, *(dict(zip(wide, (float(z) for z in row), strict=True)) for row in others)]

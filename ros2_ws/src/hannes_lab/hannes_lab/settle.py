@@ -14,12 +14,17 @@ from .rig import Rig
 from .surrogate import AnchoredRig, anchored_at
 
 MOVES = 12
-"""How often the anchor moves at most."""
+"""How often the anchor moves, or a fit is carried on, at most."""
 
 SETTLED = 1.0
 LITTLE = 0.005
 """The anchor stays where a further move lowers the cost by less than SETTLED, or by less than this part of what noise
-does not explain."""
+does not explain; so does a fit that is carried on."""
+
+
+def least_gain(cost: float, samples: int) -> float:
+    """By how much a further move of a fit of this cost must lower it."""
+    return max(SETTLED, LITTLE * (cost - samples))
 
 
 def seen_from(problem: Problem, found: Fit) -> Problem:
@@ -61,7 +66,7 @@ def settle(
         new = fit(
             problem, best.model, best.coordinates, best.z, rows=rows, steps=spread(best), evaluations=15
         )
-        least = max(SETTLED, LITTLE * (best.cost - samples))
+        least = least_gain(best.cost, samples)
         if best.cost - new.cost < least:
             break
         failures = problem.failures

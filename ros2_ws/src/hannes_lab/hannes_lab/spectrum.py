@@ -22,6 +22,19 @@ SURROUNDINGS = 300
 """Frequencies on each side of a line with which it is compared."""
 
 
+FEW_WAVES = tuple(0.5 * k for k in range(2, 11))
+"""Waves within the travel of the position that are tried beside the lines: so few of them are no line, but a trend."""
+
+
+def long_periods(problem: Problem, lower: float, upper: float) -> tuple[float, ...]:
+    """Periods between lower and upper [unit of the position] of which only FEW_WAVES are within the travel."""
+    travel = [b.measured for b in problem.features.blocks if b.signal == "encoder_position"]
+    if not travel:
+        return ()
+    total = max(float(x.max()) for x in travel) - min(float(x.min()) for x in travel)
+    return tuple(total / waves for waves in FEW_WAVES if lower <= total / waves <= upper)
+
+
 def position_periods(
     problem: Problem, fit: Fit, lower: float, upper: float, keep: int = 2
 ) -> tuple[float, ...]:

@@ -36,9 +36,6 @@ FAST_PLANT = "reduced"
 SLOW_PLANTS = ("mujoco",)
 """Plants of which a whole diagnosis would take longer than a coffee."""
 
-KNOWN_WELL = Nuisance.step
-"""Step of finite differences, in standard deviations, of a parameter whose prior is narrow; smaller is a wide one."""
-
 KEPT = 64
 """Corrections that are kept: one per anchor, trial and length."""
 
@@ -276,7 +273,7 @@ def rig_for(rig: Rig, model: Model, coordinates: Sequence[Coordinate], threads: 
     """
     if model.plant in SLOW_PLANTS and isinstance(rig, PlantRig):
         return AnchoredRig(rig, model, {}, threads=threads).sloped(
-            [c for c in coordinates if c.step >= KNOWN_WELL]
+            [c for c in coordinates if not c.wide]
         )
     return rig
 
