@@ -12,10 +12,11 @@ from hannes_description.model import Model
 from hannes_sim.effect import EffectParameter, EffectType
 from numpy.typing import NDArray
 
+from .features import Features
 from .fit import Fit, finite_differences, linear_minimum, prior_weights
 from .problem import Coordinate, Problem, effect_coordinates
 from .settle import seen_from
-from .spectrum import long_periods, position_periods
+from .spectrum import position_periods, whole_periods
 
 Array = NDArray[np.float64]
 Point = dict[str, float]
@@ -38,6 +39,11 @@ FINE = tuple(0.5 * 1.2**k for k in range(16))
 STRAY = 2.0
 """Strengths that are scanned too where the others leave so many times more squares than there are samples: a hand that
 sticks fits in a narrow range of strengths only, which lies anywhere between theirs."""
+
+PITS = 8
+RIPPLES = 2
+"""Of the periods at which a ripple promises more than at those beside it, so many are simulated, and so many are where
+fits start."""
 
 NEAR = 2.0
 """A base whose nuisance parameters are all within so many standard deviations is scanned from where it is alone."""
@@ -83,11 +89,15 @@ class Scan:
         kind                what is added; `model` and `coordinates` are those of the base with it
         """
         places = (base, self.at_nominal(base)) if farthest(base) > NEAR else (base,)
-        grid = _grid(kind, seen_from(self.problem, base), base)
-        best = []
+        best: list[Scored] = []
+        lines = spectral_periods(kind, seen_from(self.problem, base), base)
         for place in places:
             scan = _Place(self, kind, place, model, coordinates)
-            best.append(min(scan.scored(*grid, last=place is places[-1]), key=lambda item: item[0]))
+            if period_of(kind):
+                best += scan.rippled(shapes_of(kind, (*lines, *tried_periods(kind, self.problem.features))))
+            else:
+                every = scan.scored(shapes_of(kind), _strengths(kind), last=place is places[-1])
+                best.append(min(every, key=lambda item: item[0]))
         return sorted(best, key=lambda item: item[0])
 
     def nearer(self, start: Mapping[str, float], base: Fit) -> Fit:
@@ -163,6 +173,15 @@ class _Place:
             for z in (sign * size for size in FINE if low <= sign * size <= high):
                 yield self.score({**shape, name: z})
 
+    def rippled(self, shapes: Sequence[Point]) -> list[Scored]:
+        """The best shapes of an effect with a period, by what all its strengths gain together, and what they cost."""
+        steps: dict[str, float] = {}
+        promised = [self.jointly(shape, steps) for shape in shapes]
+        costs = np.array([np.inf, *(cost for cost, _ in promised), np.inf])
+        pits = np.flatnonzero((costs[1:-1] <= costs[:-2]) & (costs[1:-1] <= costs[2:]))
+        least = sorted((promised[k] for k in pits), key=lambda item: item[0])[:PITS]
+        return sorted((self.score(start) for _, start in least), key=lambda item: item[0])[:RIPPLES]
+
     def at(self, start: Mapping[str, float]) -> Array:
         z = {**self.here, **start}
         return self.problem.residual(
@@ -195,43 +214,71 @@ class _Place:
         )
         return cost, float(z[-1])
 
-    def joint(self, shape: Mapping[str, float]) -> Point:
+    def joint(self, shape: Point) -> Point:
         """All strengths of the effect by one Gauss-Newton step from nought, together with the place's coordinates."""
+        return self.jointly(shape, {})[1]
+
+    def jointly(self, shape: Point, steps: dict[str, float]) -> Scored:
+        """The same with the cost that the step promises; `steps` of the derivatives by name, which grow as needed."""
         place = self.place
         strengths = [k for k, c in enumerate(self.coordinates) if c.name in self.own and c.name not in shape]
         z = np.array([{**self.here, **shape}.get(c.name, 0.0) for c in self.coordinates])
-        added = finite_differences(self.problem, self.model, self.coordinates, z, place.residual, strengths)
-        prior = np.append(prior_weights(place.coordinates), np.zeros(len(strengths)))
-        pull = np.append(place.z, np.zeros(len(strengths)))
-        a = np.vstack([np.column_stack([place.jacobian[self.use], added[self.use]]), np.diag(prior)])
-        target = np.concatenate([place.residual[self.use], prior * pull])
-        step = -np.linalg.lstsq(a, target, rcond=None)[0]
+        added = finite_differences(
+            self.problem, self.model, self.coordinates, z, place.residual, strengths, steps
+        )
+        none = np.zeros(len(strengths))
+        cost, moved = linear_minimum(
+            np.column_stack([place.jacobian[self.use], added[self.use]]),
+            place.residual[self.use],
+            np.append(place.z, none),
+            np.append(prior_weights(place.coordinates), none),
+        )
         out = dict(shape)
-        for k, s in zip(strengths, step[place.z.size :], strict=True):
+        for k, s in zip(strengths, moved[place.z.size :], strict=True):
             low, high = self.coordinates[k].bounds
             out[self.coordinates[k].name] = float(np.clip(s, low, high))
-        return out
+        return cost, out
 
 
-def _grid(kind: EffectType, problem: Problem, base: Fit) -> tuple[list[Point], dict[str, list[float]]]:
-    """All combinations of an effect's shapes, with periods that the residual shows, and the strengths by parameter."""
-    shapes, strengths = [], {}
-    for c, p in zip(effect_coordinates(kind), kind.parameters, strict=True):
+def period_of(kind: EffectType) -> EffectParameter | None:
+    """The parameter of an effect that is a period in the position, if it has one."""
+    return next((p for p in kind.parameters if p.period), None)
+
+
+def tried_periods(kind: EffectType, features: Features) -> tuple[float, ...]:
+    """Periods of an effect's ripple that are tried whatever the residual looks like; none for other effects."""
+    p = period_of(kind)
+    return whole_periods(features, p.lower, p.upper) if p else ()
+
+
+def spectral_periods(kind: EffectType, problem: Problem, base: Fit) -> tuple[float, ...]:
+    """Periods of an effect's ripple at which the residual has a line; none for other effects."""
+    p = period_of(kind)
+    return position_periods(problem, base, p.lower, p.upper) if p else ()
+
+
+def shapes_of(kind: EffectType, periods: Sequence[float] = ()) -> list[Point]:
+    """All combinations of an effect's shapes, with these periods besides its own; neighbours differ in the period."""
+    of = {c.name: c for c in effect_coordinates(kind)}
+    choices = {}
+    for p in sorted(kind.parameters, key=lambda p: p.period):
         if p.vanishing is None:
-            found = _periods(problem, base, p) if p.period else ()
-            shapes.append([(c.name, c.z(v)) for v in (*(p.starts or (p.typical,)), *found)])
-        else:
+            values = p.starts or (p.typical,)
+            values = sorted({*values, *periods}) if p.period else values
+            name = f"{kind.name}.{p.name}"
+            choices[name] = [of[name].z(v) for v in values]
+    return [dict(zip(choices, shape, strict=True)) for shape in itertools.product(*choices.values())]
+
+
+def _strengths(kind: EffectType) -> dict[str, list[float]]:
+    """Strengths of the scan by parameter."""
+    out = {}
+    for c, p in zip(effect_coordinates(kind), kind.parameters, strict=True):
+        if p.vanishing is not None:
             low, high = c.bounds
             points = [c.z(v) for v in p.starts] or [z for s in STRENGTHS for z in (s, -s)]
-            strengths[c.name] = [z for z in points if low <= z <= high]
-    return [dict(shape) for shape in itertools.product(*shapes)], strengths
-
-
-def _periods(problem: Problem, base: Fit, p: EffectParameter) -> tuple[float, ...]:
-    return (
-        *position_periods(problem, base, p.lower, p.upper),
-        *long_periods(problem, p.lower, p.upper),
-    )
+            out[c.name] = [z for z in points if low <= z <= high]
+    return out
 
 
 def farthest(found: Fit) -> float:

@@ -29,7 +29,7 @@ from .problem import (
     vanishing_entry,
 )
 from .rig import Nuisance
-from .scan import Scan, Scored, farthest, point_key
+from .scan import Scan, Scored, farthest, point_key, shapes_of, tried_periods
 from .settle import MOVES, at_anchor, least_gain, seen_from, settle, slopes_at
 from .surrogate import AnchoredRig, anchored_at
 
@@ -547,15 +547,11 @@ class Search:
         kind = self.effect(name)
         model, coordinates = self.with_effects((*base.names, name))
         own = [c for c in coordinates if c.name.startswith(f"{name}.")]
-        shapes = [
-            [(f"{name}.{p.name}", v) for v in (p.starts or (p.typical,))]
-            for p in kind.parameters
-            if p.vanishing is None
-        ]
         strengths = [c for c, p in zip(own, kind.parameters, strict=True) if p.vanishing is not None]
         out = []
-        for shape in itertools.product(*shapes):
-            z = np.array([c.z({**here, **dict(shape)}.get(c.name, c.offset)) for c in coordinates])
+        # Every other period: those between are no further chances.
+        for shape in shapes_of(kind, tried_periods(kind, self.problem.features)[1::2]):
+            z = np.array([shape.get(c.name, c.z(here.get(c.name, c.offset))) for c in coordinates])
             values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
             r = self.problem.residual(model, values)
             columns = [coordinates.index(c) for c in strengths]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammainccinv, gammaincinv
 
+from .features import Features
 from .fit import Fit
 from .problem import Problem
 
@@ -22,17 +23,18 @@ SURROUNDINGS = 300
 """Frequencies on each side of a line with which it is compared."""
 
 
-FEW_WAVES = tuple(0.5 * k for k in range(2, 11))
-"""Waves within the travel of the position that are tried beside the lines: so few of them are no line, but a trend."""
+WAVES = tuple(0.5 * k for k in range(1, 129))
+"""Waves within the travel of the position whose ripple is simulated: a sampled, rectified, averaged signal of a plant
+with friction and a controller around it shows few of them as lines."""
 
 
-def long_periods(problem: Problem, lower: float, upper: float) -> tuple[float, ...]:
-    """Periods between lower and upper [unit of the position] of which only FEW_WAVES are within the travel."""
-    travel = [b.measured for b in problem.features.blocks if b.signal == "encoder_position"]
+def whole_periods(features: Features, lower: float, upper: float) -> tuple[float, ...]:
+    """Periods between lower and upper [unit of the position] of which WAVES are within the travel, longest first."""
+    travel = [b.measured for b in features.blocks if b.signal == "encoder_position"]
     if not travel:
         return ()
     total = max(float(x.max()) for x in travel) - min(float(x.min()) for x in travel)
-    return tuple(total / waves for waves in FEW_WAVES if lower <= total / waves <= upper)
+    return tuple(total / waves for waves in WAVES if lower <= total / waves <= upper)
 
 
 def position_periods(

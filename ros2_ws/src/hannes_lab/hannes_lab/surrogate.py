@@ -272,9 +272,7 @@ def rig_for(rig: Rig, model: Model, coordinates: Sequence[Coordinate], threads: 
     where the truth is expected.  Across a wide prior a slope at its middle would lead astray.
     """
     if model.plant in SLOW_PLANTS and isinstance(rig, PlantRig):
-        return AnchoredRig(rig, model, {}, threads=threads).sloped(
-            [c for c in coordinates if not c.wide]
-        )
+        return AnchoredRig(rig, model, {}, threads=threads).sloped([c for c in coordinates if not c.wide])
     return rig
 
 
