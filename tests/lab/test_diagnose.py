@@ -189,6 +189,20 @@ def test_a_friction_that_makes_the_hand_stick_is_fitted() -> None:
     )
 
 
+@pytest.mark.parametrize("period", [0.6, 4.2])
+def test_a_ripple_of_any_period_is_fitted(period: float) -> None:
+    """A current that is logged at 30 Hz and rectified shows no line; periods between the usual ones count too."""
+    model = Model.load()
+    ripple = load_effect("cogging").entry({"sine": 0.01, "cosine": 0.0, "period": period})
+    recordings, _ = make_set(model, [ripple], seed=100, closures=5)
+    prepared = prepare([make_trial(r) for r in recordings], model)
+    search = Search(prepared.problem, model, prepared.nuisances, effect_sources(only=["cogging"]))
+    found = search.polish(search.add(search.null(), "cogging"))
+    assert found.fit.values["cogging.period"] == pytest.approx(period, rel=0.005)
+    assert found.fit.values["cogging.sine"] == pytest.approx(0.01, rel=0.05)
+    assert found.fit.cost < 2.0 * prepared.features.size < 0.1 * search.null().fit.cost
+
+
 def test_one_closure_is_said_to_hold_nothing_out() -> None:
     model = Model.load()
     recordings, _ = make_set(model, [], seed=104, closures=1, conditions=("fast",))

@@ -14,9 +14,11 @@ from hannes_lab.diagnose import Diagnosis, _adequate, _short_of, diagnose, effec
 from hannes_lab.executor import Executor
 from hannes_lab.grasp import _seen, with_seen_objects
 from hannes_lab.hand import outer_loop
+from hannes_lab.hide import make_set
 from hannes_lab.prepare import load_trials, prepare
-from hannes_lab.search import Candidate, Search
-from hannes_lab.trials import Trial
+from hannes_lab.problem import nuisance_coordinate
+from hannes_lab.search import Candidate, Search, wide_starts
+from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import strength_of
 from lab.foreign_bags import Signals, signals_of_set, write_set
 
@@ -87,6 +89,25 @@ def test_a_slow_closure_on_nothing_is_no_grasp_where_the_fast_one_brakes() -> No
     assert _seen((q, gripping), [(q, slow)], nominal) is not None
 
 
+def test_the_model_as_it_is_is_fitted_from_several_starts_where_little_is_known(tmp_path: Path) -> None:
+    """The misfit of a closed loop of unknown gains has several minima; the fit must not end in a high one."""
+    prepared = prepare(strange_set(tmp_path, "gear_backlash"), Model.load())
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, {})
+    starts = wide_starts(search.coordinates)
+    wide = set(starts[1])
+    assert starts[0] == {} and len(starts) > 3 and all(set(one) == wide for one in starts[1:])
+    assert {"control.kp", "wire.stiffness"} <= wide and not wide & {"motor.kt", "friction.coulomb"}
+    costs = [search._begin(start).cost for start in starts]
+    assert min(costs) < 0.97 * costs[0], "these data have one minimum, and show nothing"
+    assert search.null().fit.cost <= min(costs)
+
+
+def test_where_all_is_described_the_fit_has_one_start() -> None:
+    made, _ = make_set(Model.load(), [], seed=11, closures=2, conditions=("slow",))
+    prepared = prepare([make_trial(one) for one in made], Model.load())
+    assert wide_starts([nuisance_coordinate(n) for n in prepared.nuisances]) == [{}]
+
+
 def test_one_hand_whose_zero_is_elsewhere_in_each_recording_explains_nothing(tmp_path: Path) -> None:
     prepared = prepare(strange_set(tmp_path), Model.load())
     sources = effect_sources(only=FEW, model=prepared.model)
@@ -105,3 +126,24 @@ def test_one_hand_whose_zero_is_elsewhere_in_each_recording_explains_nothing(tmp
     assert not _adequate(search, moved([0.0, 0.0, 15.0]), limits)
     said = _short_of(search, moved([0.0, 0.0, 15.0]), limits)
     assert said == "encoder.zero differs between recordings of one hand by 10 times its tolerance"
+
+
+def test_a_set_that_needs_a_hand_far_outside_the_tolerances_explains_nothing(tmp_path: Path) -> None:
+    """The misfit of a thousand samples hides what the prior says of one parameter."""
+    prepared = prepare(strange_set(tmp_path), Model.load())
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, {})
+    null = search.null()
+    limits = chance(search.problem, null.fit, {})
+
+    def at(name: str, off: float) -> Candidate:
+        names = [c.name for c in null.fit.coordinates]
+        z = null.fit.z.copy()
+        z[names.index(name)] = off
+        return replace(null, fit=replace(null.fit, z=z))
+
+    assert _adequate(search, at("friction.coulomb", -7.5), limits)
+    assert not _adequate(search, at("friction.coulomb", -9.0), limits)
+    said = _short_of(search, at("friction.coulomb", -9.0), limits)
+    assert said.startswith("friction.coulomb would be ") and "9 times its tolerance off" in said, said
+    assert "calibrate" in said
+    assert _adequate(search, at("control.current_kp", 9.0), limits), "of this nothing is known beforehand"

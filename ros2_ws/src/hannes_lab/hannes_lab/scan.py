@@ -162,7 +162,7 @@ class _Place:
         scores += [self.score(start) for _, start in sorted(follow, key=lambda item: item[0])[:FOLLOW]]
         yield from scores
         if len(strengths) > 1:
-            # The amplitudes of one wave, or the halves of a difference, are right together only.
+            # The halves of a difference are right together only.
             yield from (self.score(self.joint(shape)) for shape in shapes)
             return
         left, lowest = min(scores, key=lambda item: item[0])

@@ -23,7 +23,7 @@ SURROUNDINGS = 300
 """Frequencies on each side of a line with which it is compared."""
 
 
-WAVES = tuple(0.5 * k for k in range(1, 129))
+WAVES = tuple(0.5 * k for k in range(1, 81))
 """Waves within the travel of the position whose ripple is simulated: a sampled, rectified, averaged signal of a plant
 with friction and a controller around it shows few of them as lines."""
 
