@@ -9,6 +9,7 @@ interrupted run goes on where it stopped.  The seeds differ from those on which 
     pairs     two effects at three times their limits
     outside   effects of bench/outside_effects.py
     typical   every effect at its typical strength
+    shapes    effects at typical strength whose SHAPES are others than those at which the search starts
     logging   LOGGED at typical strength, with other loggers: 100 Hz, position alone, current alone
     mismatch  made by the MuJoCo plant, fitted by the reduced one
 """
@@ -39,7 +40,16 @@ from hannes_lab.trials import make_trial
 from hannes_sim.effect import catalogue, effect_source, load_effect
 from joblib import Parallel, delayed
 
-SETS = ("nothing", "single", "pairs", "outside", "typical", "logging", "mismatch")
+SETS = ("nothing", "single", "pairs", "outside", "typical", "shapes", "logging", "mismatch")
+SHAPES = {
+    "cogging": (0.6, 1.1, 2.3, 4.2, 9.0, 13.0, 20.0),
+    "stribeck_friction": (0.1, 0.6, 2.0, 10.0),
+    "presliding_friction": (0.015, 0.2, 1.5),
+    "glove_hysteresis": (0.05, 1.2, 10.0),
+    "winding_heating": (4.0, 35.0, 300.0),
+    "velocity_strengthening": (0.1, 0.6, 1.8),
+}
+"""Values of each effect's one shape parameter."""
 LOGGED = (
     "viscous_friction",
     "load_dependent_friction",
@@ -179,6 +189,15 @@ def detection_factors(names: list[str], seed: int = 7) -> dict[str, float]:
     return out
 
 
+def detection_limits(folder: Path) -> dict[str, float]:
+    """The detection factors of the whole catalogue, from the folder if these sources made them before."""
+    file = folder / f"limits-{source_hash()[:20]}.json"
+    if not file.exists():
+        file.write_text(json.dumps(detection_factors(sorted(catalogue()))))
+    limits: dict[str, float] = json.loads(file.read_text())
+    return limits
+
+
 def strength(name: str, factor: float) -> tuple[tuple[str, float], ...]:
     """Parameters of an effect at `factor` times its typical strength; shape parameters stay typical."""
     return tuple(
@@ -228,6 +247,12 @@ def cases(kinds: list[str], limits: dict[str, float], quick: bool, first: int = 
     typical = [(name, strength(name, min(1.0, highest_factor(name)))) for name in names]
     if "typical" in kinds:
         out += [Case("typical", (one,), 1.0, first + 40_000 + k) for k, one in enumerate(typical)]
+    if "shapes" in kinds:
+        different = [(name, value) for name, values in SHAPES.items() for value in values]
+        for k, (name, value) in enumerate(different):
+            (shape,) = [p.name for p in load_effect(name).parameters if p.vanishing is None]
+            given = {**dict(strength(name, 1.0)), shape: value}
+            out.append(Case("shapes", ((name, tuple(given.items())),), 1.0, first + 70_000 + k))
     if "logging" in kinds:
         for k, (one, (sensors, signals)) in enumerate(
             itertools.product((t for t in typical if t[0] in LOGGED), LOGGERS.values())
@@ -334,6 +359,9 @@ def table(results: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
         exact = [r for r in typical if r["named"] == r["hidden"]]
         rows.append(("one hidden at typical strength: named exactly", share(exact, typical), ""))
         rows.append(("one hidden at typical strength: named, or in a tie", named(typical), ""))
+    shapes = [r for r in results if r["kind"] == "shapes"]
+    if shapes:
+        rows.append(("shapes between those of the search: named, or in a tie", named(shapes), ""))
     for loggers in LOGGERS:
         part = [r for r in results if r["kind"] == "logging" and r["loggers"] == loggers]
         if part:
@@ -384,12 +412,7 @@ def main() -> int:
         raise HannesError(f"--sets: valid are {', '.join(SETS)}.")
     sys.path.insert(0, str(Path(__file__).parent))
     options.out.mkdir(parents=True, exist_ok=True)
-    limits_file = options.out / f"limits-{source_hash()[:20]}.json"
-    if limits_file.exists():
-        limits = json.loads(limits_file.read_text())
-    else:
-        limits = detection_factors(sorted(catalogue()))
-        limits_file.write_text(json.dumps(limits))
+    limits = detection_limits(options.out) if {"single", "pairs"} & set(kinds) else {}
     todo = cases(kinds, limits, options.quick, TUNING_SEED if options.tuning else JUDGING_SEED)
     first, _, step = options.part.partition("/")
     if not (first.isdigit() and step.isdigit() and 1 <= int(first) <= int(step)):
