@@ -9,6 +9,7 @@ interrupted run goes on where it stopped.  The seeds differ from those on which 
     pairs     two effects at three times their limits
     outside   effects of bench/outside_effects.py
     typical   every effect at its typical strength
+    strong    every effect at STRONG times that, or as strong as it may be
     shapes    effects at typical strength whose SHAPES are others than those at which the search starts
     logging   LOGGED at typical strength, with other loggers: 100 Hz, position alone, current alone
     mismatch  made by the MuJoCo plant, fitted by the reduced one
@@ -40,7 +41,7 @@ from hannes_lab.trials import make_trial
 from hannes_sim.effect import catalogue, effect_source, load_effect
 from joblib import Parallel, delayed
 
-SETS = ("nothing", "single", "pairs", "outside", "typical", "shapes", "logging", "mismatch")
+SETS = ("nothing", "single", "pairs", "outside", "typical", "strong", "shapes", "logging", "mismatch")
 SHAPES = {
     "cogging": (0.6, 1.1, 2.3, 4.2, 9.0, 13.0, 20.0),
     "stribeck_friction": (0.1, 0.6, 2.0, 10.0),
@@ -67,6 +68,7 @@ LOGGERS = {
 }
 """Name of the loggers of `hide`, and the signals that take part (all if none are named)."""
 FACTORS = (1.5, 2.0, 3.0, 5.0, 8.0)
+STRONG = 4.0
 JUDGING_SEED = 50_000
 """First seed of the sets that are judged; thresholds are set on seeds below."""
 
@@ -247,6 +249,9 @@ def cases(kinds: list[str], limits: dict[str, float], quick: bool, first: int = 
     typical = [(name, strength(name, min(1.0, highest_factor(name)))) for name in names]
     if "typical" in kinds:
         out += [Case("typical", (one,), 1.0, first + 40_000 + k) for k, one in enumerate(typical)]
+    if "strong" in kinds:
+        strong = [(name, strength(name, min(STRONG, highest_factor(name)))) for name in names]
+        out += [Case("strong", (one,), STRONG, first + 80_000 + k) for k, one in enumerate(strong)]
     if "shapes" in kinds:
         different = [(name, value) for name, values in SHAPES.items() for value in values]
         for k, (name, value) in enumerate(different):
@@ -359,6 +364,9 @@ def table(results: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
         exact = [r for r in typical if r["named"] == r["hidden"]]
         rows.append(("one hidden at typical strength: named exactly", share(exact, typical), ""))
         rows.append(("one hidden at typical strength: named, or in a tie", named(typical), ""))
+    strong = [r for r in results if r["kind"] == "strong"]
+    if strong:
+        rows.append((f"one hidden at {STRONG:.0f} x typical strength: named, or in a tie", named(strong), ""))
     shapes = [r for r in results if r["kind"] == "shapes"]
     if shapes:
         rows.append(("shapes between those of the search: named, or in a tie", named(shapes), ""))
