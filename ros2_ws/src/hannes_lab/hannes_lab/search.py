@@ -147,10 +147,12 @@ class Search:
         return fit(self.problem, self.model, self.coordinates, start, rows=self.rows, evaluations=WHOLE)
 
     def _ended(self, found: Fit) -> Fit:
-        """A fit carried on until it stays."""
+        """A fit, perhaps of another problem (other noise), carried on until it stays."""
+        if self.slow:
+            return self._again(found, WHOLE)
         found = at_anchor(self.problem, found, self.rows)[1]
         samples = self.problem.features.size if self.rows is None else int(self.rows.sum())
-        for _ in range(1 if self.slow else MOVES):
+        for _ in range(MOVES):
             new = self._again(found, WHOLE)
             gain = found.cost - new.cost
             if gain > 0.0:
