@@ -124,7 +124,7 @@ LUGRE: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...]], ...] = 
     (("quadratic drag",), "100 Hz", (("drag", 2.5e-4),)),
     (("a shaking mount",), "100 Hz", (("shaking", 0.02),)),
 )
-"""What is hidden in the hand of bristles, the log, and values of its Hand.  What went wrong in these was looked into."""
+"""What is hidden in the hand of bristles, the log, and values of its Hand; what went wrong in these was looked into."""
 
 LUGRE_ONCE: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...]], ...] = (
     ((), "50 Hz", (("friction", 0.021), ("load_friction", 0.011))),
