@@ -203,6 +203,16 @@ def test_a_ripple_of_any_period_is_fitted(period: float) -> None:
     assert found.fit.cost < 2.0 * prepared.features.size < 0.1 * search.null().fit.cost
 
 
+def test_what_the_model_gets_wrong_of_the_first_closure_is_no_scatter() -> None:
+    """A slack shows in how the first closure differs; counted as scatter, chance seemed to gain 150 with a slack."""
+    model = Model.load()
+    recordings, _ = make_set(model, [strength_of("wire_slack", 2.0)], seed=5, closures=8)
+    prepared = prepare([make_trial(r) for r in recordings], model)
+    search = Search(prepared.problem, model, prepared.nuisances, effect_sources(only=["wire_slack"]))
+    null = search.null()
+    assert chance(search.problem, null.fit, search.signatures(null)).gain < 60.0
+
+
 def test_one_closure_is_said_to_hold_nothing_out() -> None:
     model = Model.load()
     recordings, _ = make_set(model, [], seed=104, closures=1, conditions=("fast",))

@@ -98,7 +98,7 @@ def test_the_model_as_it_is_is_fitted_from_several_starts_where_little_is_known(
     assert starts[0] == {} and len(starts) > 3 and all(set(one) == wide for one in starts[1:])
     assert {"control.kp", "wire.stiffness"} <= wide and not wide & {"motor.kt", "friction.coulomb"}
     costs = [search._begin(start).cost for start in starts]
-    assert min(costs) < 0.97 * costs[0], "these data have one minimum, and show nothing"
+    assert max(costs) > 1.03 * min(costs), "these data have one minimum, and show nothing"
     assert search.null().fit.cost <= min(costs)
 
 

@@ -49,13 +49,18 @@ def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple
     if not resampled:
         return rng.standard_normal((problem.features.size, draws)), False
     raw = np.empty((problem.features.size, draws))
-    signs: dict[tuple[str, int], Array] = {}
+    drawn: dict[tuple[str, int], tuple[Array, Array]] = {}
     for block, rows, deviation in zip(blocks, problem.features.slices, problem.deviations, strict=True):
-        n = block.n
-        s = signs.setdefault((block.condition, n), rng.choice([-1.0, 1.0], size=(draws, n)))
-        scale = np.sqrt(n / (n - 1.0))
+        n, m = block.n, deviation.shape[0]
+        if (block.condition, n) not in drawn:
+            # A first closure that starts from another state scatters like any other.
+            which = np.tile(np.arange(n) - (n - m), (draws, 1))
+            which[:, : n - m] = rng.integers(m, size=(draws, n - m))
+            drawn[block.condition, n] = which, rng.choice([-1.0, 1.0], size=(draws, n))
+        which, signs = drawn[block.condition, n]
+        scale = np.sqrt(m / (m - 1.0))
         for k in range(draws):
-            raw[rows, k] = block.combine(s[k][:, None] * deviation) * scale
+            raw[rows, k] = block.combine(signs[k][:, None] * deviation[which[k]]) * scale
     for own, lower in problem.discrepancy:
         raw[own] += lower @ rng.standard_normal((own.size, draws))
     return problem.whiten(raw), True

@@ -38,6 +38,11 @@ MOST_SHIFT = 15
 """Ticks by which a closure may begin earlier or later than where its reference was seen to move."""
 
 
+def alike(closures: Array) -> Array:
+    """Closures (n, p) without the first of four or more, which starts from another state than the others."""
+    return closures[1:] if closures.shape[0] >= 4 else closures
+
+
 @dataclass(frozen=True)
 class Block:
     """One signal of one condition of one trial.
@@ -64,7 +69,7 @@ class Block:
     @property
     def alike(self) -> Array:
         """The closures without the first of four or more, which starts from another state than the others."""
-        return self.measured[1:] if self.n >= 4 else self.measured
+        return alike(self.measured)
 
     @property
     def floor(self) -> float:

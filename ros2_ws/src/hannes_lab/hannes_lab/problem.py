@@ -26,7 +26,7 @@ from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from .features import Block, Features
+from .features import Block, Features, alike
 from .rig import Nuisance, Rig
 
 Array = NDArray[np.float64]
@@ -159,7 +159,8 @@ class Problem:
     """Data, noise and rig of one data set; counts its simulations.
 
     whitener    per condition, rows of the features and the Cholesky factor of their covariance
-    deviations  per block (n, p), scatter of the closures: what the model does not predict of their differences
+    deviations  per block (m, p), scatter of the m closures that start alike: what the model does not predict of their
+                differences
     discrepancy  rows of the features and the Cholesky factor of the covariance of the model's own error, if it has one
     """
 
@@ -237,12 +238,10 @@ def build_problem(
     taken from the roughness of the curve.
     """
     base = features.closures(rig, model, values)
-    # What the model says of the differences between closures (the first one starts from another state; a motor that
-    # heats up) is no scatter.
-    deviations = [
-        (block.measured - block.measured.mean(axis=0)) - (predicted - predicted.mean(axis=0))
-        for block, predicted in zip(features.blocks, base, strict=True)
-    ]
+    # What the model says of the differences between closures (a motor that heats up) is no scatter, and what it gets
+    # wrong of the first, which starts from another state, is none either.
+    rest = [alike(b.measured) - alike(predicted) for b, predicted in zip(features.blocks, base, strict=True)]
+    deviations = [e - e.mean(axis=0) for e in rest]
     variances = []
     for block, e in zip(features.blocks, deviations, strict=True):
         span = float(np.ptp(block.measured)) or 1.0
@@ -351,7 +350,7 @@ def _sample_variance(measured: Array, deviations: Array) -> Array:
     """Variance of one sample along the phase (p,), smoothed."""
     n = measured.shape[0]
     if n >= 3:
-        return _smooth((deviations**2).sum(axis=0) / (n - 1))
+        return _smooth((deviations**2).sum(axis=0) / (deviations.shape[0] - 1))
     # One or two closures: the second difference of a smooth curve is mostly noise (variance factor 6).
     second = np.diff(measured.mean(axis=0), 2)
     robust = (np.median(np.abs(second)) / 0.6745) ** 2 / 6.0 * n
