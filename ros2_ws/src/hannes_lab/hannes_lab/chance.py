@@ -1,7 +1,8 @@
 """What chance reaches: misfit and best gain of data in which nothing is missing, from the repeats themselves.
 
 Wild bootstrap over closures: the deviations of the closures from their mean, with random signs, averaged, are one draw
-of the noise of the mean (Liu 1988, Mammen 1993).  It keeps all correlation along the closure and between signals,
+of the noise of the mean (Liu 1988, Mammen 1993); for a first closure, which starts from another state, stands another
+one.  It keeps all correlation along the closure and between signals,
 and it assumes no distribution.  With too few closures to resample, draws come from the estimated covariance instead.
 """
 

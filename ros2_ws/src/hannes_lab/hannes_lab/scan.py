@@ -263,8 +263,8 @@ def shapes_of(kind: EffectType, periods: Sequence[float] = ()) -> list[Point]:
     choices = {}
     for p in sorted(kind.parameters, key=lambda p: p.period):
         if p.vanishing is None:
-            values = p.starts or (p.typical,)
-            values = sorted({*values, *periods}) if p.period else values
+            own = p.starts or (p.typical,)
+            values = sorted({*own, *periods}) if p.period else own
             name = f"{kind.name}.{p.name}"
             choices[name] = [of[name].z(v) for v in values]
     return [dict(zip(choices, shape, strict=True)) for shape in itertools.product(*choices.values())]
