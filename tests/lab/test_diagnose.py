@@ -235,7 +235,7 @@ def test_an_effect_outside_the_catalogue_is_called_unknown(tmp_path: Path) -> No
 def test_triples_are_not_tried_where_the_pairs_lead_nowhere(tmp_path: Path) -> None:
     file = tmp_path / "latch.py"
     file.write_text(OUTSIDE)
-    prepared, _ = data([f"{file}:Flap"], seed=105, conditions=QUICK[1:])
+    prepared, _ = data([f"{file}:Flap"], seed=106, conditions=QUICK[1:])
     only = ["gravity", "glove_stiffness", "encoder_offset", "return_preload"]
     texts = set[str]()
     found = diagnose(prepared, effect_sources(only=only), progress=lambda done, total, text: texts.add(text))

@@ -119,7 +119,7 @@ def test_other_data_or_another_model_find_nothing_of_it(prepared: Prepared, tmp_
     stiffer = prepared.model.with_values(
         {"friction.viscous": 1.01 * prepared.model.parameters.value("friction.viscous")}
     )
-    assert fitted(problem) == 0 and fitted(problem) == 1
+    assert fitted(problem) == 0 and fitted(problem) == 2, "where it starts, and where it ends"
     assert fitted(replace(problem, features=features)) == 0
     assert fitted(problem, stiffer) == 0
 

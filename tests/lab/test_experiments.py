@@ -7,14 +7,12 @@ import pytest
 from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.executor import Executor
-from hannes_lab.experiments import separating_experiments
+from hannes_lab.experiments import VISIBLE, separating_experiments
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.search import Search
 from hannes_lab.trials import make_trial
 from hannes_sim.effect import strength_of
-
-TELL_APART = 3.0
 
 
 def distance_of_fits(prepared: Prepared, names: Sequence[str]) -> float:
@@ -42,10 +40,10 @@ def test_nothing_recorded_in_operation_tells_slack_from_an_encoder_offset(undesc
     only = ["wire_slack", "encoder_offset", "gravity"]
     found = diagnose(undescribed, effect_sources(only=only, model=undescribed.model))
     assert set(found.tied) == {("wire_slack",), ("encoder_offset",)}
-    assert found.experiments[0].distance < TELL_APART
+    assert found.experiments[0].distance < VISIBLE
     (note,) = (n for n in found.notes if "no further recording" in n)
     assert "the encoder read before the controller is on" in note
 
 
 def test_another_recording_tells_slack_from_a_glove(undescribed: Prepared) -> None:
-    assert distance_of_fits(undescribed, ["wire_slack", "glove_stiffness"]) > TELL_APART
+    assert distance_of_fits(undescribed, ["wire_slack", "glove_stiffness"]) > VISIBLE

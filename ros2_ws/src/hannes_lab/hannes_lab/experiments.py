@@ -21,8 +21,8 @@ from .trials import Trial
 Array = NDArray[np.float64]
 
 
-VISIBLE = 3.0
-"""Whitened distance from which two models can be told apart by an experiment."""
+VISIBLE = 5.0
+"""Whitened distance from which two models can be told apart by an experiment: its square is twice what a tie allows."""
 
 
 @dataclass(frozen=True)

@@ -58,11 +58,13 @@ class Scan:
 
     rows    features that take part; None: all
     nominal bases with their nuisance parameters at the nominal values, as far as they are known
+    minima  of a base that has several, the others
     """
 
     problem: Problem
     rows: NDArray[np.bool_] | None = None
     nominal: dict[bytes, Fit] = field(default_factory=dict)
+    minima: dict[bytes, tuple[Fit, ...]] = field(default_factory=dict)
 
     def at_nominal(self, base: Fit) -> Fit:
         """The base's effects with the nuisance parameters back at their nominal values.
@@ -84,11 +86,14 @@ class Scan:
     def starts(
         self, kind: EffectType, base: Fit, model: Model, coordinates: Sequence[Coordinate]
     ) -> list[Scored]:
-        """Best starting points of an effect on top of a fit: from the base, and from its nominal values if it is off.
+        """Best starting points of an effect on top of a fit: from the base and its other minima, and from its nominal
+        values if it is off.
 
         kind                what is added; `model` and `coordinates` are those of the base with it
         """
-        places = (base, self.at_nominal(base)) if farthest(base) > NEAR else (base,)
+        places = [base, *self.minima.get(point_key(base), ())]
+        if farthest(base) > NEAR:
+            places.append(self.at_nominal(base))
         best: list[Scored] = []
         lines = spectral_periods(kind, seen_from(self.problem, base), base)
         for place in places:
@@ -101,14 +106,16 @@ class Scan:
         return sorted(best, key=lambda item: item[0])
 
     def nearer(self, start: Mapping[str, float], base: Fit) -> Fit:
-        """Where a fit from a start looks from: the base, or its nominal nuisance parameters if they are nearer.
+        """Where a fit from a start looks from: the base, another minimum of it, or its nominal nuisance parameters,
+        whichever is nearest.
 
         A slow plant is anchored there; on a fast one the derivatives by the nuisance parameters are tried from there
         too, since those of a base that a strong effect drove far off lead nowhere.
         """
+        prior = prior_weights(base.coordinates) > 0.0
         z = np.array([start.get(c.name, 0.0) for c in base.coordinates if c.prior])
-        there = base.z[prior_weights(base.coordinates) > 0.0]
-        return self.at_nominal(base) if z @ z < (z - there) @ (z - there) else base
+        places = (base, *self.minima.get(point_key(base), ()), self.at_nominal(base))
+        return min(places, key=lambda place: float(np.linalg.norm(z - place.z[prior])))
 
     def true_start(
         self, base: Fit, model: Model, coordinates: Sequence[Coordinate], start: Mapping[str, float]

@@ -67,6 +67,11 @@ APART = 1.5
 """Further starts of the fit of the model as it is, and how far off, in standard deviations of the priors, where these
 are wide: the misfit of a closed loop whose gains, wire and object are not known has several minima."""
 
+MINIMA = 2
+DISTINCT = 3.0
+"""How many of its other minima extensions of the model as it is are tried from too, and from how many standard
+deviations on two ends of a fit are not the same: an effect may be in reach from one of them only."""
+
 RIVAL_START = 2.0
 """A second start of a fit is carried on if it costs less than so many times what the first reached."""
 
@@ -112,11 +117,12 @@ class Search:
     before: Candidate | None = None
     found: dict[Names, Candidate] = field(default_factory=dict)
     _nominal: dict[bytes, Fit] = field(default_factory=dict)
+    _minima: dict[bytes, tuple[Fit, ...]] = field(default_factory=dict)
     _key: str = ""
 
     def __post_init__(self) -> None:
         self.coordinates = tuple(nuisance_coordinate(n) for n in self.nuisances)
-        self.scan = Scan(self.problem, self.rows, self._nominal)
+        self.scan = Scan(self.problem, self.rows, self._nominal, self._minima)
 
     @property
     def slow(self) -> bool:
@@ -130,18 +136,20 @@ class Search:
     def null(self) -> Candidate:
         """The model as it is, with its nuisance parameters fitted."""
         if () not in self.found:
-            best = self.once(Search._ended, self._begun(), text="nominal: fit")
+            begun = self._begun()
+            best = self.once(Search._ended, begun[0], text="nominal: fit")
             self.found[()] = Candidate((), best, best.cost)
+            if not self.slow:
+                self._minima[point_key(best)] = other_minima(best, begun[1:])
         return self.found[()]
 
-    def _begun(self) -> Fit:
-        """The fit of the model as it is with the noise that was estimated before, or the best from several starts."""
+    def _begun(self) -> list[Fit]:
+        """The fit of the model as it is with the noise that was estimated before, or those from several starts."""
         if self.before is not None:
-            return self.before.fit
+            return [self.before.fit]
         starts = wide_starts(self.coordinates)
-        return min(
-            self.each(Search._begin, [(start,) for start in starts], "nominal: fit"), key=lambda f: f.cost
-        )
+        found = self.each(Search._begin, [(start,) for start in starts], "nominal: fit")
+        return sorted(found, key=lambda f: f.cost)
 
     def _begin(self, start: Mapping[str, float]) -> Fit:
         return fit(self.problem, self.model, self.coordinates, start, rows=self.rows, evaluations=WHOLE)
@@ -222,6 +230,7 @@ class Search:
                 # Where the effect makes the hand stick, the linear moves of the scan lead astray, and so may either
                 # point's derivatives.
                 still = {c.name: at.get(c.name, 0.0) for c in coordinates if not c.prior}
+                still |= {c.name: near.point[c.name] for c in near.coordinates if c.prior}
                 ways += [(base.fit, at), (near, still)]
             for point, begin in ways:
                 known = _derivatives(point, [c for c in point.coordinates if short or c.prior])
@@ -351,7 +360,13 @@ class Search:
             rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values, self.problem.counts
         )
         return replace(
-            self, problem=problem, before=self.found.get((), self.before), found={}, _nominal={}, _key=""
+            self,
+            problem=problem,
+            before=self.found.get((), self.before),
+            found={},
+            _nominal={},
+            _minima={},
+            _key="",
         )
 
     def _refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
@@ -510,7 +525,7 @@ class Search:
         work = [(function, items[k]) for k in missing]
         key = f"{next(_runs)} {id(self)} {os.getpid()} {time.time_ns()}"
         for number, (result, simulations, failures) in self.executor.run(
-            _work, (*shared, self._nominal), key, work
+            _work, (*shared, self._nominal, self._minima), key, work
         ):
             self.problem.counts.simulations += simulations
             self.problem.counts.failures += failures
@@ -571,9 +586,11 @@ def _work(
     """One item in a worker, which keeps the search for the next ones: (result, simulations, failures)."""
 
     def build() -> Search:
-        problem, model, nuisances, sources, rows, points = shared
+        problem, model, nuisances, sources, rows, points, minima = shared
         problem = replace(problem, rig=own(problem.rig), counts=Counts())
-        return Search(problem, model, nuisances, sources, rows=rows, _nominal=dict(points))
+        return Search(
+            problem, model, nuisances, sources, rows=rows, _nominal=dict(points), _minima=dict(minima)
+        )
 
     search = _held.get(key, build)
     counts = search.problem.counts
@@ -601,3 +618,13 @@ def wide_starts(coordinates: Sequence[Coordinate]) -> list[dict[str, float]]:
     wide = [c.name for c in coordinates if c.wide]
     others = np.random.default_rng(0).uniform(-APART, APART, (STARTS if wide else 0, len(wide)))
     return [{}, *(dict(zip(wide, (float(z) for z in row), strict=True)) for row in others)]
+
+
+def other_minima(best: Fit, others: Sequence[Fit]) -> tuple[Fit, ...]:
+    """Those of the others, best first, that cost about as little and are elsewhere than the best and one another."""
+    out: list[Fit] = []
+    for one in others:
+        apart = [float(np.linalg.norm(one.z - known.z)) for known in (best, *out)]
+        if one.cost <= RIVAL_START * best.cost and min(apart) > DISTINCT and len(out) < MINIMA:
+            out.append(one)
+    return tuple(out)
