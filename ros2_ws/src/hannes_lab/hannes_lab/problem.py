@@ -239,8 +239,10 @@ def build_problem(
     """
     base = features.closures(rig, model, values)
     # What the model says of the differences between closures (a motor that heats up) is no scatter, and what it gets
-    # wrong of the first, which starts from another state, is none either.
-    rest = [alike(b.measured) - alike(predicted) for b, predicted in zip(features.blocks, base, strict=True)]
+    # wrong of the first, which starts from another state, is none either; where that is hardly seen, it stays scatter.
+    rest = [b.measured - predicted for b, predicted in zip(features.blocks, base, strict=True)]
+    if not rig.approximate:
+        rest = [alike(e) for e in rest]
     deviations = [e - e.mean(axis=0) for e in rest]
     variances = []
     for block, e in zip(features.blocks, deviations, strict=True):

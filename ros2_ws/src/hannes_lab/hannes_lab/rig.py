@@ -102,6 +102,7 @@ class Rig(Protocol):
     experiments  True where `hannes record` can run the experiments that separate effects
     pooled    True: in a fit every sample of a signal counts the same, and the fit is of least square error.  For
               machines that repeat far better than any model will fit; the exact moments would rule the fit otherwise
+    approximate  True where a plant is seen through another one: how the first closure differs is not seen well then
     """
 
     trials: tuple[Trial, ...]
@@ -109,6 +110,7 @@ class Rig(Protocol):
     points: int
     drive_signals: tuple[str, ...]
     pooled: bool
+    approximate: bool
     figures: bool
     phases: Mapping[str, str]
     experiments: bool
@@ -150,7 +152,7 @@ class PlantRig:
                  from REFERENCE_SIZES; effects are scaled by them
     linear       True where position is in m and the drive gives N: units are named so
     without      effects that have no meaning here, with the reason
-    floor, points, drive_signals, pooled, phases, figures, experiments  see Rig
+    floor, points, drive_signals, pooled, approximate, phases, figures, experiments  see Rig
 
     Plants are built once per (model structure, trial) and then only re-parametrised.
     """
@@ -164,6 +166,7 @@ class PlantRig:
     points: int = 160
     drive_signals: tuple[str, ...] = ("motor_current", "motor_effort")
     pooled: bool = False
+    approximate: bool = False
     phases: Mapping[str, str] = {}
     figures: bool = False
     experiments: bool = False

@@ -64,6 +64,7 @@ class AnchoredRig:
         self._ends = ends or {trial.name: compact_end(trial) for trial in exact.trials}
         self.trials = exact.trials
         self.floor, self.points, self.pooled = exact.floor, exact.points, exact.pooled
+        self.approximate = True
         self.drive_signals, self.without = exact.drive_signals, exact.without
         self.phases, self.figures, self.experiments = exact.phases, exact.figures, exact.experiments
         self._model, self._values = model, dict(values)
