@@ -139,7 +139,7 @@ LUGRE_ONCE: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...]], ..
     (("hysteresis",), "50 Hz", (("hysteresis", 0.05),)),
     (("quadratic drag",), "50 Hz", (("drag", 5e-4),)),
 )
-"""The same, with other values and loggers; seen once, when all was done."""
+"""The same, with other values and loggers; the slack that was missed in these was looked into."""
 
 
 @dataclass(frozen=True)

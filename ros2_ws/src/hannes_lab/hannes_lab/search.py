@@ -159,13 +159,12 @@ class Search:
         if self.slow:
             return self._again(found, WHOLE)
         found = at_anchor(self.problem, found, self.rows)[1]
-        samples = self.problem.features.size if self.rows is None else int(self.rows.sum())
         for _ in range(MOVES):
             new = self._again(found, WHOLE)
             gain = found.cost - new.cost
             if gain > 0.0:
                 found = new
-            if gain < least_gain(found.cost, samples):
+            if gain < least_gain(found, self.rows):
                 break
         return found
 

@@ -22,9 +22,10 @@ LITTLE = 0.005
 does not explain; so does a fit that is carried on."""
 
 
-def least_gain(cost: float, samples: int) -> float:
-    """By how much a further move of a fit of this cost must lower it."""
-    return max(SETTLED, LITTLE * (cost - samples))
+def least_gain(found: Fit, rows: NDArray[np.bool_] | None) -> float:
+    """By how much a further move of a fit must lower its cost."""
+    samples = found.residual.size if rows is None else int(rows.sum())
+    return max(SETTLED, LITTLE * (found.cost - samples))
 
 
 def seen_from(problem: Problem, found: Fit) -> Problem:
@@ -60,13 +61,12 @@ def settle(
         return problem, found
     problem, best = at_anchor(problem, found, rows)
     problem = _sloped(problem, best, afresh)
-    samples = best.residual.size if rows is None else int(rows.sum())
     astray = not afresh
     for _ in range(moves):
         new = fit(
             problem, best.model, best.coordinates, best.z, rows=rows, steps=spread(best), evaluations=15
         )
-        least = least_gain(best.cost, samples)
+        least = least_gain(best, rows)
         if best.cost - new.cost < least:
             break
         failures = problem.failures
