@@ -19,10 +19,13 @@ from .surrogate import FAST_PLANT, SLOW_PLANTS
 from .trials import Trial
 
 Array = NDArray[np.float64]
+Loose = tuple[Coordinate, float, float]
+"""A parameter that stays open: coordinate, z and standard deviation of z."""
 
 
 VISIBLE = 5.0
-"""Whitened distance from which two models can be told apart by an experiment: its square is twice what a tie allows."""
+"""Whitened distance d from which an experiment tells two models apart: where one of them is right, their costs differ
+by d^2 with a standard deviation of 2 d, which at 5 is more than a tie allows (6) in 97 %."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,8 @@ def separating_experiments(
     """The candidate conditions that separate the tied models best.
 
     Each model predicts one closure with its fitted parameters; differences count in units of the sensors' noise and
-    scatter as they were seen in these data, after the nuisance parameters have compensated what they can.
+    scatter as they were seen in these data, after the nuisance parameters have compensated what they can within their
+    tolerances, and the effects' own parameters within what these data leave open.
     """
     if not prepared.rig.experiments:
         return ()
@@ -86,10 +90,15 @@ def separating_experiments(
         rig = type(prepared.rig)([trial])  # type: ignore[call-arg]  # the protocol has no constructor
         open_ = [_open(rig, c) for c in tied]
         predictions = [_predict(rig, c, trial, noise, o) for c, o in zip(tied, open_, strict=True)]
-        sensitivity = _sensitivity(rig, tied[0], trial, noise, open_[0], predictions[0])
+        of_all = _sensitivity(rig, tied[0], trial, noise, open_[0], predictions[0])
+        of_effects = [
+            _sensitivity(rig, c, trial, noise, o, p, _found(c))
+            for c, o, p in zip(tied, open_, predictions, strict=True)
+        ]
         distances = []
         for a, b in itertools.combinations(range(len(tied)), 2):
             d = predictions[a] - predictions[b]
+            sensitivity = np.column_stack([of_all, of_effects[a], of_effects[b]])
             reduced = d - sensitivity @ np.linalg.solve(
                 sensitivity.T @ sensitivity + np.eye(sensitivity.shape[1]), sensitivity.T @ d
             )
@@ -116,15 +125,17 @@ def _trial(like: Trial, name: str, profile: str, options: dict[str, float], gras
     return Trial(name, like.period, reference, like.signals, like.closures, meta)
 
 
-def _open(rig: Rig, candidate: Candidate) -> list[tuple[Coordinate, float]]:
-    """What stays open in a new recording, as coordinates with their z: the hand's fitted parameters, and its own.
+def _open(rig: Rig, candidate: Candidate) -> list[Loose]:
+    """What stays open in a new recording within the tolerances: the hand's fitted parameters, and its own.
 
     Those of the recording (the encoder's zero, clocks) begin at the mean of what was fitted to the others; those of
     its object are of that object.
     """
     fit = candidate.fit
     out = [
-        (c, float(z)) for c, z in zip(fit.coordinates, fit.z, strict=True) if c.prior and "@" not in c.name
+        (c, float(z), 1.0)
+        for c, z in zip(fit.coordinates, fit.z, strict=True)
+        if c.prior and "@" not in c.name
     ]
     for nuisance in rig.nuisances(fit.model):
         family, its_own, _ = nuisance.name.partition("@")
@@ -132,8 +143,17 @@ def _open(rig: Rig, candidate: Candidate) -> list[tuple[Coordinate, float]]:
             fitted = [v for name, v in fit.values.items() if name.startswith(f"{family}@")]
             if fitted and not family.startswith("object."):
                 nuisance = replace(nuisance, mean=float(np.mean(fitted)))
-            out.append((nuisance_coordinate(nuisance), 0.0))
+            out.append((nuisance_coordinate(nuisance), 0.0, 1.0))
     return out
+
+
+def _found(candidate: Candidate) -> list[Loose]:
+    """The effects' parameters as they were found, with the standard deviations that the data leave them."""
+    fit = candidate.fit
+    sds = np.sqrt(np.maximum(np.diag(fit.covariance()), 0.0))
+    return [
+        (c, float(z), float(sd)) for c, z, sd in zip(fit.coordinates, fit.z, sds, strict=True) if not c.prior
+    ]
 
 
 def _predict(
@@ -141,13 +161,13 @@ def _predict(
     candidate: Candidate,
     trial: Trial,
     noise: dict[str, float],
-    open_: Sequence[tuple[Coordinate, float]],
+    open_: Sequence[Loose],
 ) -> Array:
     model = candidate.fit.model
     values = {n: v for n, v in candidate.fit.values.items() if "@" not in n}
     run = rig.simulate(
         model.with_plant(FAST_PLANT) if model.plant in SLOW_PLANTS else model,
-        values | {c.name: c.value(z) for c, z in open_},
+        values | {c.name: c.value(z) for c, z, _ in open_},
         trial,
         trial.reference,
     )
@@ -162,11 +182,14 @@ def _sensitivity(
     candidate: Candidate,
     trial: Trial,
     noise: dict[str, float],
-    open_: Sequence[tuple[Coordinate, float]],
+    open_: Sequence[Loose],
     base: Array,
+    of: Sequence[Loose] | None = None,
 ) -> Array:
+    """Change of the prediction (size, k) by a standard deviation of each of these, or of all that stays open."""
     columns = []
-    for k, (c, z) in enumerate(open_):
-        moved = [*open_[:k], (c, z + c.step), *open_[k + 1 :]]
-        columns.append((_predict(rig, candidate, trial, noise, moved) - base) / c.step)
+    for c, z, sd in open_ if of is None else of:
+        step = c.inside_step(z)
+        moved = [*open_, (c, z + step, sd)]
+        columns.append((_predict(rig, candidate, trial, noise, moved) - base) * (sd / step))
     return np.column_stack(columns) if columns else np.zeros((base.size, 0))
