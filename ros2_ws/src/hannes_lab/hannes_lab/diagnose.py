@@ -28,7 +28,7 @@ from .features import Features, data_used
 from .fit import Fit
 from .greedy import grow
 from .prepare import Prepared
-from .problem import Problem, build_problem
+from .problem import Coordinate, Problem, build_problem
 from .rig import Rig
 from .screen import usable_effects
 from .search import HOPELESS, PENALTY, Candidate, Progress, Search, silent
@@ -313,6 +313,7 @@ def diagnose(
             *prepared.notes,
             *choice.notes,
             *_inseparable(search, experiments),
+            *_end_notes(best),
             *_identifiability_notes(best),
             *_failed(search.problem),
         ),
@@ -585,14 +586,14 @@ def _found(search: Search, best: Candidate, name: str, limits: Chance, falls: Se
     kind = search.effect(name)
     inflate = max(1.0, best.fit.cost / limits.median)
     intervals = intervals_of(best.fit, inflate)
+    at_end = {c.name for c in _at_end(best.fit)}
     parameters = {}
     for p in kind.parameters:
         value = best.fit.values[f"{name}.{p.name}"]
         low, high = intervals[f"{name}.{p.name}"]
         span = p.upper - p.lower
-        on_bound = min(value - p.lower, p.upper - value) < 1e-6 * span and p.vanishing != value
         parameters[p.name] = ParameterEstimate(
-            value, low, high, p.unit, not on_bound and high - low < 0.8 * span
+            value, low, high, p.unit, f"{name}.{p.name}" not in at_end and high - low < 0.8 * span
         )
     step = next((k for k, f in enumerate(falls) if f.added == name), len(falls) - 1)
     before = {(s.condition, s.signal): s for s in falls[step - 1].signals}
@@ -717,6 +718,19 @@ def _inseparable(search: Search, experiments: Sequence[Experiment]) -> list[str]
         f"no further recording that was considered tells {', '.join(' + '.join(t) for t in experiments[0].separates)} "
         f"apart (they differ by {experiments[0].distance:.1f} standard deviations of the noise at most); what shows "
         f"each: {shown}"
+    ]
+
+
+def _at_end(found: Fit) -> list[Coordinate]:
+    """The effects' parameters that would go beyond their range."""
+    return [c for c, z in zip(found.coordinates, found.z, strict=True) if not c.prior and c.at_end(float(z))]
+
+
+def _end_notes(best: Candidate) -> list[str]:
+    return [
+        f"{c.name} lies at the end of its range ({c.lower:g} to {c.upper:g} {c.unit}): the true value may lie beyond "
+        "it, or it is another effect of a similar form"
+        for c in _at_end(best.fit)
     ]
 
 

@@ -37,6 +37,9 @@ DISCREPANCY_LENGTH = 0.1
 FAILED = 1e3
 """Whitened residual of a simulation that diverged: a large finite penalty."""
 
+AT_END = 1e-3
+"""Part of a parameter's range within which it is at the end of it: a fit stops short of its bounds."""
+
 SMALLEST_STRENGTH = 0.02
 """In typical values: an effect weaker than this is stepped as if it were this strong, well above the roughness of a
 simulation with dry friction."""
@@ -95,6 +98,12 @@ class Coordinate:
         )
         high = np.inf if not np.isfinite(self.upper) else self.z(self.upper)
         return low, high
+
+    def at_end(self, z: float) -> bool:
+        """True close to an end of a finite range, other than where an effect is switched off."""
+        low, high = self.bounds
+        near = AT_END * (high - low)
+        return bool(np.isfinite(near)) and any(abs(z - end) <= near for end in (low, high) if end != 0.0)
 
 
 def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
