@@ -1,8 +1,10 @@
 """A real machine, the EMPS bench: `python bench/emps.py [DATA_EMPS.mat] [--jobs N] [--picture FILE]`.
 
 Grows a model from mass and viscous friction by `--greedy` and prints what each effect is worth on moves that took no
-part in its fit: by closed-loop simulation, and of the force by inverse dynamics (then fitted so).  The data are not
-part of the project; their default place is $HANNES_DATA/emps/DATA_EMPS.mat.  Interrupted, it goes on where it stopped.
+part in its fit: by closed-loop simulation, and of the force by inverse dynamics (then fitted so).  If the second
+recording of the machine, DATA_EMPS_PULSES.mat, lies beside the first, the final model's error on it is printed too.
+The data are not part of the project; their default place is $HANNES_DATA/emps/DATA_EMPS.mat.  Interrupted, it goes on
+where it stopped.
 """
 
 from __future__ import annotations
@@ -26,12 +28,16 @@ from hannes_lab.executor import Executor
 from hannes_lab.inverse import force_residual, rows
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import effect_coordinates, nuisance_coordinate, vanishing_entry
-from hannes_lab.rig import load_rig
+from hannes_lab.rig import PlantRig, load_rig
 from hannes_sim.effect import load_effect
 from numpy.typing import NDArray
+from scipy.io import loadmat
 from scipy.optimize import least_squares
 
 Array = NDArray[np.float64]
+
+DISTURBED = 0.15
+"""Seconds after an edge of the pulses of the second recording for which the axis is off its course."""
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("HANNES_DATA", ROOT.parent / "shared" / "data")) / "emps" / "DATA_EMPS.mat"
@@ -72,6 +78,40 @@ def left_out(
         power += float(np.sum(force_residual(rig, model, values(z), trial)[used] ** 2))
         ticks += int(used.sum())
     return values(whole), float(np.sqrt(power / ticks))
+
+
+def undisturbed(path: Path, period: float) -> NDArray[np.bool_]:
+    """Which ticks of the second recording are not within DISTURBED after an edge of its force pulses."""
+    pulses = np.asarray(loadmat(path)["pulses_N"], float).ravel()
+    out = np.ones(pulses.size, dtype=bool)
+    for edge in np.flatnonzero(np.diff(pulses)):
+        out[edge + 1 : edge + 1 + round(DISTURBED / period)] = False
+    return out
+
+
+def on_second_recording(
+    kind: type[PlantRig], found: Diagnosis, first: Path, second: Path
+) -> list[tuple[str, float, float]]:
+    """Errors on the undisturbed ticks of moves: (of what, position in m, force in N).
+
+    Of the model as given, of the final one, and of the first recording itself, taken for a prediction of the second.
+    """
+    one, two = kind.read([first])[0], kind.read([second])[0]
+    rig = kind([two])
+    moving = np.logical_or.reduce([rows(two, condition) for condition in two.conditions])
+    used = moving & undisturbed(second, two.period)
+    measured = {name: values for name, (_, values) in two.signals.items()}
+    predicted = {
+        "model as given": rig.simulate(Model.load(kind.model), {}, two, two.reference),
+        "final model": rig.simulate(found.model, found.values, two, two.reference),
+        "first recording": {name: values for name, (_, values) in one.signals.items()},
+    }
+    out = []
+    for what, signals in predicted.items():
+        errors = {n: signals[n][: used.size][used] - measured[n][used] for n in measured}
+        rms = {n: float(np.sqrt(np.mean(e**2))) for n, e in errors.items()}
+        out.append((what, rms["encoder_position"], rms["drive_force"]))
+    return out
 
 
 def draw(found: Diagnosis, repeats: dict[str, float], path: Path) -> None:
@@ -131,6 +171,11 @@ def main() -> int:
         )
     print(f"mass {found.values['motor.armature']:.2f} kg, {len(names)} effects", end="")
     print(f", ripple {1e3 * found.values['cogging.period']:.4f} mm" if "cogging" in names else "")
+    second = options.data.with_name("DATA_EMPS_PULSES.mat")
+    if second.is_file():
+        print(f"\n{'on the second recording':<32} {'position, um':>14} {'force, N':>10}")
+        for what, position, force in on_second_recording(rig, found, options.data, second):
+            print(f"{what:<32} {1e6 * position:>14.2f} {force:>10.2f}")
     if options.picture:
         draw(found, pooled_repeatability(prepared.features), options.picture)
     return 0
