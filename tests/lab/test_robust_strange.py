@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hannes_bags.reading import read_bag
-from hannes_description.model import Model
+from hannes_description.model import EffectEntry, Model
 from hannes_lab.chance import chance
 from hannes_lab.diagnose import Diagnosis, _adequate, _short_of, diagnose, effect_sources
 from hannes_lab.executor import Executor
+from hannes_lab.fit import Fit
 from hannes_lab.grasp import _seen, with_seen_objects
 from hannes_lab.hand import outer_loop
 from hannes_lab.hide import make_set
@@ -19,7 +20,7 @@ from hannes_lab.prepare import load_trials, prepare
 from hannes_lab.problem import nuisance_coordinate
 from hannes_lab.search import Candidate, Search, wide_starts
 from hannes_lab.trials import Trial, make_trial
-from hannes_sim.effect import strength_of
+from hannes_sim.effect import load_effect, strength_of
 from lab.foreign_bags import Signals, signals_of_set, write_set
 
 STRANGE = {
@@ -49,6 +50,11 @@ def strange_set(folder: Path, *effects: str) -> list[Trial]:
     return load_trials([write_set(folder / "bags", conditions, late)])
 
 
+def offset_of(angle: float) -> EffectEntry:
+    kind = load_effect("encoder_offset")
+    return kind.entry({"offset": angle})
+
+
 def diagnosed(trials: list[Trial]) -> Diagnosis:
     prepared = prepare(trials, Model.load())
     return diagnose(prepared, effect_sources(only=FEW), max_effects=1)
@@ -67,6 +73,27 @@ def test_a_strange_hand_lacks_nothing(tmp_path: Path) -> None:
     found = diagnosed(strange_set(tmp_path))
     assert found.verdict == "nothing"
     assert any("something was grasped" in note for note in found.notes)
+
+
+def test_a_strange_hand_may_rest_off_its_open_stop(tmp_path: Path) -> None:
+    """The controller sees the encoder only: where that reads too little, the wire is wound up by as much."""
+    wound = signals_of_set(effects=[offset_of(-1.2)], closures=6, seed=11)
+    prepared = prepare(load_trials([write_set(tmp_path / "bags", wound)]), Model.load())
+
+    def null(without: str = "") -> Fit:
+        nuisances = [n for n in prepared.nuisances if n.name != without]
+        return Search(prepared.problem, prepared.model, nuisances, {}).null().fit
+
+    def friction_off(found: Fit) -> float:
+        return max(abs(found.point["friction.coulomb"]), abs(found.point["hand.coulomb"]))
+
+    fitted = null()
+    assert 0.5 < fitted.values["encoder.homing"] < 1.5
+    assert friction_off(fitted) < 2.5 < 4.0 < friction_off(null(without="encoder.homing"))
+    (said,) = (
+        note for note in diagnose(prepared, effect_sources(only=["gravity"])).notes if "do not tell" in note
+    )
+    assert "encoder.homing" in said and "control.kp" in said
 
 
 @pytest.mark.slow

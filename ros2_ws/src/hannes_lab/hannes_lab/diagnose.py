@@ -314,6 +314,7 @@ def diagnose(
             *choice.notes,
             *_inseparable(search, experiments),
             *_end_notes(best),
+            *_undescribed(best),
             *_identifiability_notes(best),
             *_failed(search.problem),
         ),
@@ -732,6 +733,16 @@ def _end_notes(best: Candidate) -> list[str]:
         "it, or it is another effect of a similar form"
         for c in _at_end(best.fit)
     ]
+
+
+def _undescribed(best: Candidate) -> list[str]:
+    """What the recordings do not say of the machine as a whole, as it was fitted."""
+    fitted = [
+        f"{c.name} {c.value(float(z)):.3g} {c.unit}".rstrip()
+        for c, z in zip(best.fit.coordinates, best.fit.z, strict=True)
+        if c.wide and "@" not in c.name
+    ]
+    return [f"the recordings do not tell these, so they were fitted: {', '.join(fitted)}"] if fitted else []
 
 
 def _identifiability_notes(best: Candidate) -> list[str]:

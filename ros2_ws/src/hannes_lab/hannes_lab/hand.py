@@ -49,6 +49,13 @@ WIDE_STEP = 0.1
 _UNKNOWN_ZERO_SD = 0.1
 """rad; what a hand calls open whose homing nobody described."""
 
+HOMING = "encoder.homing"
+_UNKNOWN_HOMING_SD = 1.0
+"""rad; how far the wire is wound up, and the hand off its open stop, where the encoder reads zero: nobody described it."""
+
+WINDING = 0.6
+"""s in which the motor winds the wire up before the first closure."""
+
 _WIRE = "wire.stiffness"
 _UNKNOWN_WIRE_SD = 0.5
 """Width of its prior (of the logarithm): nobody measured it, and on an unknown object it counts with the object's."""
@@ -219,6 +226,8 @@ class HandRig(PlantRig):
         if _WIRE in known and model.parameters.value(_WIRE) > 0.0:
             unit = model.parameters[_WIRE].unit
             out.append(Nuisance(_WIRE, model.parameters.value(_WIRE), _UNKNOWN_WIRE_SD, True, unit=unit))
+        if strange:
+            out.append(Nuisance(HOMING, 0.0, _UNKNOWN_HOMING_SD, False, unit="rad", lower=0.0))
         logged = [t.signals["motor_current"][0] for t in strange if "motor_current" in t.signals]
         if logged:
             step = float(np.median(np.diff(logged[0])))
@@ -253,11 +262,18 @@ class HandRig(PlantRig):
         plant.set("encoder.resolution", 0.0)
         return plant
 
-    def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
+    def run(
+        self,
+        model: Model,
+        values: Mapping[str, float],
+        trial: Trial,
+        reference: Array,
+        before: Array | None = None,
+    ) -> Rollout:
         """The rollout itself; gains of the controller and the clock of the reference may be among the values."""
         of_plant: dict[str, float] = {}
         gains: dict[str, float] = {}
-        delay = lead = 0.0
+        delay = lead = homing = 0.0
         for name, value in values.items():
             if name.startswith("control."):
                 gains[name.removeprefix("control.")] = value
@@ -265,12 +281,20 @@ class HandRig(PlantRig):
                 delay = value
             elif name == REFERENCE_LEAD and not is_described(trial):
                 lead = value
+            elif name == HOMING:
+                homing = 0.0 if is_described(trial) else value
             elif not name.startswith("log."):
                 of_plant[name] = value
+        before = None
+        if homing:
+            if trial.closures[0].start < WINDING:
+                before = np.full(round(WINDING / trial.period), reference[0])
+            zero = f"encoder.zero@{trial.name}"
+            of_plant[zero] = of_plant.get(zero, 0.0) - homing
         _, controller, _ = self._plant(model, trial)
         if isinstance(controller, DoublePID):
             controller.parameters[:] = replace(controller.settings, **gains).to_array()
-        return super().run(model, of_plant, trial, _moved(reference, delay, lead, trial))
+        return super().run(model, of_plant, trial, _moved(reference, delay, lead, trial), before)
 
     def observed(
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array

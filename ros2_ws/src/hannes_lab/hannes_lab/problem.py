@@ -215,7 +215,8 @@ class Problem:
         for rows, lower in self.discrepancy:
             sd[rows] = np.linalg.norm(lower, axis=1)
         out = []
-        for block, where in zip(self.features.blocks, self.features.slices, strict=True):
+        for block, both in zip(self.features.blocks, self.features.slices, strict=True):
+            where = slice(both.start, both.start + block.phase.size)
             precision = sd[where] ** -2.0
             if precision.any():
                 square = float((raw[where] ** 2 * precision**2).sum() / precision.sum())
@@ -298,13 +299,25 @@ def build_problem(
             if not rows.size:
                 continue
             covariance = single / count
-            if part[0][1] == 0:
-                own_error = _own_error([features.blocks[k] for k in own], rig, model)
-                if own_error.any():
-                    covariance = covariance + own_error
-                    discrepancy.append((rows, np.asarray(np.linalg.cholesky(own_error), dtype=np.float64)))
+            blocks = [features.blocks[k] for k in own]
+            share = 1.0 if part[0][1] == 0 else _share_of_first(features, blocks)
+            own_error = share**2 * _own_error(blocks, rig, model)
+            if own_error.any():
+                covariance = covariance + own_error
+                discrepancy.append((rows, np.asarray(np.linalg.cholesky(own_error), dtype=np.float64)))
             whitener.append((rows, np.linalg.cholesky(covariance)))
     return Problem(rig, features, tuple(whitener), tuple(deviations), counts or Counts(), tuple(discrepancy))
+
+
+def _share_of_first(features: Features, blocks: Sequence[Block]) -> float:
+    """With which weight an error of the first closure alone counts in the drift; 0 where all start from the same state.
+
+    The form of the model is the same for the others, and drops out of their differences.
+    """
+    if all(features.trials[b.trial].fresh for b in blocks):
+        return 0.0
+    ramp = np.linspace(-0.5, 0.5, blocks[0].n)
+    return float(0.5 / (ramp @ ramp))
 
 
 def _own_error(blocks: Sequence[Block], rig: Rig, model: Model) -> Array:

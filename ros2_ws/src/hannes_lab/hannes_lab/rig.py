@@ -264,8 +264,15 @@ class PlantRig:
         """Signals by name, simulated afresh."""
         return self.logged(self.run(model, values, trial, reference), trial)
 
-    def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
-        """The rollout itself, with all that the plant can show."""
+    def run(
+        self,
+        model: Model,
+        values: Mapping[str, float],
+        trial: Trial,
+        reference: Array,
+        before: Array | None = None,
+    ) -> Rollout:
+        """The rollout itself, with all that the plant can show; it starts from reset, or from where `before` leads."""
         plant, controller, base = self._plant(model, trial)
         wanted = _wanted(model, values, trial)
         for name in set(base) - set(wanted):
@@ -274,7 +281,9 @@ class PlantRig:
             if name not in base:
                 base[name] = plant.get(name)
             plant.set(name, value)
-        done = rollout(plant, controller, reference, joints=False)
+        if before is not None:
+            rollout(plant, controller, before, joints=False)
+        done = rollout(plant, controller, reference, reset=before is None, joints=False)
         self._came_back = _came_back(done, trial)
         return done
 

@@ -204,10 +204,11 @@ class Search:
         """Fits of the base set plus one effect from each start, best first; a slow plant runs at their ends only.
 
         worth   penalised cost below which the set is of interest
-        short   a few steps only, with all derivatives of the base taken as constant
+        short   a few steps only, with all derivatives of the base taken as constant; none ends early, since where
+                nuisance parameters have taken over the effect, what straight lines promise says little
         """
         model, coordinates = self.with_effects((*base.names, name))
-        worth -= _penalty(coordinates)
+        worth = np.inf if short else worth - _penalty(coordinates)
         found = []
         for start in starts:
             near = self.scan.nearer(start, base.fit)
