@@ -51,7 +51,8 @@ _UNKNOWN_ZERO_SD = 0.1
 
 HOMING = "encoder.homing"
 _UNKNOWN_HOMING_SD = 1.0
-"""rad; how far the wire is wound up, and the hand off its open stop, where the encoder reads zero: nobody described it."""
+"""rad; how far the wire is wound up, and the hand off its open stop, where an encoder reads zero whose homing nobody
+described."""
 
 WINDING = 0.6
 """s in which the motor winds the wire up before the first closure."""
