@@ -116,6 +116,17 @@ def test_a_slow_closure_on_nothing_is_no_grasp_where_the_fast_one_brakes() -> No
     assert _seen((q, gripping), [(q, slow)], nominal) is not None
 
 
+def test_a_quick_start_is_no_part_of_the_grasp() -> None:
+    """A fast closure takes more current from the start on; where the object is begins later."""
+    q = np.linspace(2.5, 12.5, 200)
+    free = np.full(q.size, 0.15)
+    pressing = np.interp(q, [2.5, 5.0, 7.5, 12.0], [0.45, 0.20, 0.18, 0.50])
+    seen = _seen((q, pressing), [(q, free)], (0.044, 0.0015, 0.21))
+    assert seen is not None
+    stiffness, place = seen
+    assert place == pytest.approx(7.2, abs=0.5) and stiffness == pytest.approx(0.21 * 0.32 / 4.5, rel=0.1)
+
+
 def test_the_model_as_it_is_is_fitted_from_several_starts_where_little_is_known(tmp_path: Path) -> None:
     """The misfit of a closed loop of unknown gains has several minima; the fit must not end in a high one."""
     prepared = prepare(strange_set(tmp_path, "gear_backlash"), Model.load())

@@ -153,8 +153,9 @@ def _seen(
             factor, base = EXCESS[0], there
     if current[peak] < factor * base[peak] + EXCESS[1]:
         return None
-    excess = np.maximum.accumulate(np.maximum(current - base, 0.0)[: peak + 1])
-    first, last = (int(np.searchsorted(excess, part * excess[-1])) for part in RISE)
+    excess = (current - base)[: peak + 1]
+    # From the peak backwards: what a quick start takes more than a slow one is no object.
+    first, last = (int(np.max(np.flatnonzero(excess < part * excess[-1]), initial=0)) for part in RISE)
     run = max(float(q[last] - q[first]), 1e-3)
     slope = max(float(excess[last] - excess[first]), 1e-6) / run
     place = float(q[first]) - float(excess[first]) / slope
