@@ -6,7 +6,8 @@ diagnosed with the nominal model.  Every result is kept in a file named by its c
 that an interrupted run goes on where it stopped.  `--tuning` takes other seeds and strengths, for setting thresholds.
 `--full-hand` takes closures of the full hand in MuJoCo instead, without what describes them: a third simulator to the
 reduced plant, on which no threshold was set.  `--lugre` takes the hand of `bench/lugre_hand.py`, with another friction,
-other gains and another move: first the sets of which the failures were looked into, then others.
+other gains and another move: first the sets of which the failures were looked into, then others.  `--wound` takes both
+hands with the wire wound up at encoder zero, so that they rest off their open stop.
 """
 
 from __future__ import annotations
@@ -142,6 +143,37 @@ LUGRE_ONCE: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...]], ..
 """The same, with other values and loggers; the slack that was missed in these was looked into."""
 
 
+WOUND: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...], bool], ...] = (
+    ((), "30 Hz rectified", (("zero", -1.3),), False),
+    ((), "100 Hz", (("zero", -0.8), ("friction", 0.015), ("load_friction", 0.005)), True),
+    ((), "50 Hz", (("zero", -2.0), ("friction", 0.017), ("load_friction", 0.004)), False),
+    (("viscous_friction",), "50 Hz", (("zero", -1.3), ("viscous", 4.0)), True),
+    (
+        ("load_dependent_friction",),
+        "30 Hz rectified",
+        (("zero", -0.7), ("capstan", 0.25), ("friction", 0.017)),
+        False,
+    ),
+    (("glove_stiffness",), "100 Hz", (("zero", -1.6), ("glove", 4e-4), ("glove_power", 2.0)), False),
+    (
+        ("cogging",),
+        "100 Hz",
+        (("zero", -1.0), ("ripple", 0.02), ("waves", 1.2), ("load_friction", 0.005)),
+        False,
+    ),
+    (("stribeck_friction",), "50 Hz", (("zero", -1.5), ("stiction", 0.045), ("friction", 0.017)), True),
+    (
+        ("glove_stiffness", "viscous_friction"),
+        "30 Hz rectified",
+        (("zero", -1.2), ("glove", 4e-4), ("viscous", 4.0)),
+        True,
+    ),
+    (("a worn spot",), "100 Hz", (("zero", -1.3), ("spot", 0.04)), False),
+)
+"""Hands that rest off their open stop, some with half the dry friction: what is hidden, the log, values of Hand, and
+whether the hand is that of bristles."""
+
+
 @dataclass(frozen=True)
 class Case:
     """One set of recordings: slow and fast closures on nothing, slow ones on an object."""
@@ -173,6 +205,14 @@ def lugre_cases() -> list[Case]:
         Case(*what, first + k, lugre=True)
         for first, some in ((500, LUGRE), (550, LUGRE_ONCE))
         for k, what in enumerate(some)
+    ]
+
+
+def wound_cases() -> list[Case]:
+    """The sets of both hands with the wire wound up at encoder zero."""
+    return [
+        Case(hidden, log, values, 650 + k, lugre=lugre)
+        for k, (hidden, log, values, lugre) in enumerate(WOUND)
     ]
 
 
@@ -216,7 +256,7 @@ def record(case: Case, folder: Path) -> None:
         hands = []
         for _ in range(case.repeats):
             moved = {n: getattr(hand, n) * math.exp(sd * rng.standard_normal()) for n, sd in SCATTER.items()}
-            moved["zero"] = 0.002 * rng.standard_normal()
+            moved["zero"] = hand.zero + 0.002 * rng.standard_normal()
             if grasp:
                 moved["object_stiffness"] = hand.object_stiffness * math.exp(0.02 * rng.standard_normal())
                 moved["object_at"] = hand.object_at + 0.03 * rng.standard_normal()
@@ -314,12 +354,16 @@ def main() -> int:
     which.add_argument("--tuning", action="store_true", help="other seeds and strengths")
     which.add_argument("--full-hand", action="store_true", help="closures of the full hand, undescribed")
     which.add_argument("--lugre", action="store_true", help="the hand of bristles instead of the other one")
+    which.add_argument("--wound", action="store_true", help="both, resting off their open stop")
     parser.add_argument("--out", type=Path, default=Path("out/foreign"), help="folder of the kept results")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    todo = (
-        full_hand_cases() if options.full_hand else lugre_cases() if options.lugre else cases(options.tuning)
-    )
+    if options.full_hand:
+        todo = full_hand_cases()
+    elif options.lugre:
+        todo = lugre_cases()
+    else:
+        todo = wound_cases() if options.wound else cases(options.tuning)
     runs = Parallel(n_jobs=options.jobs, return_as="generator")(
         delayed(kept)(run_case, c, options.out / f"{c.key}.json") for c in todo
     )
