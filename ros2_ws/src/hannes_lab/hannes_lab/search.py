@@ -204,8 +204,9 @@ class Search:
         """Fits of the base set plus one effect from each start, best first; a slow plant runs at their ends only.
 
         worth   penalised cost below which the set is of interest
-        short   a few steps only, with all derivatives of the base taken as constant; none ends early, since where
-                nuisance parameters have taken over the effect, what straight lines promise says little
+        short   a few steps only, with all derivatives of the base taken as constant, but afresh from the nominal values;
+                none ends early, since where nuisance parameters have taken over the effect, what straight lines promise
+                says little
         """
         model, coordinates = self.with_effects((*base.names, name))
         worth = np.inf if short else worth - _penalty(coordinates)
@@ -225,15 +226,19 @@ class Search:
                 # Costs that were seen from different places cannot be compared before the anchor is there.
                 found.append(at_anchor(self.problem, one, self.rows)[1])
                 continue
-            ways = [(near, at)]
+            ways: list[tuple[Fit | None, Mapping[str, float]]] = [(near, at)]
             if near is not base.fit:
                 # Where the effect makes the hand stick, the linear moves of the scan lead astray, and so may either
                 # point's derivatives.
                 still = {c.name: at.get(c.name, 0.0) for c in coordinates if not c.prior}
                 still |= {c.name: near.point[c.name] for c in near.coordinates if c.prior}
-                ways += [(base.fit, at), (near, still)]
+                # From far off the way is long, and bends: the model as it is has gone another one.
+                afresh = short and not base.names and near is self.scan.at_nominal(base.fit)
+                ways += [(base.fit, at), (None if afresh else near, still)]
             for point, begin in ways:
-                known = _derivatives(point, [c for c in point.coordinates if short or c.prior])
+                known = (
+                    _derivatives(point, [c for c in point.coordinates if short or c.prior]) if point else {}
+                )
                 found.append(
                     fit(
                         self.problem,
@@ -242,7 +247,7 @@ class Search:
                         begin,
                         rows=self.rows,
                         known=known,
-                        evaluations=SHORT if short else LONG,
+                        evaluations=SHORT if short and point else LONG,
                         worth=worth,
                     )
                 )
