@@ -204,9 +204,9 @@ class Search:
         """Fits of the base set plus one effect from each start, best first; a slow plant runs at their ends only.
 
         worth   penalised cost below which the set is of interest
-        short   a few steps only, with all derivatives of the base taken as constant, but afresh from the nominal values;
-                none ends early, since where nuisance parameters have taken over the effect, what straight lines promise
-                says little
+        short   a few steps only, with all derivatives of the base taken as constant, but afresh from the nominal
+                values; none ends early, since where nuisance parameters have taken over the effect, what straight lines
+                promise says little
         """
         model, coordinates = self.with_effects((*base.names, name))
         worth = np.inf if short else worth - _penalty(coordinates)
