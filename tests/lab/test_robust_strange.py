@@ -105,6 +105,25 @@ def test_an_effect_is_found_on_a_strange_hand(tmp_path: Path) -> None:
     assert found.ranking[0].names == ("viscous_friction",) and found.ranking[0].explained > 0.9
 
 
+@pytest.mark.slow
+def test_a_slack_is_found_on_a_hand_of_half_the_friction(tmp_path: Path) -> None:
+    """The fit without it goes far off: six tolerances in friction, and as many in the spring's preload."""
+    light = {"friction.coulomb": 0.012, "hand.coulomb": 0.005, "wire.stiffness": 5.0}
+    light |= {"control.kp": 0.36, "control.damping": 0.02}
+    slack = load_effect("wire_slack").entry({"slack": 1.0})
+    conditions = signals_of_set(
+        model=Model.load().with_values(light),
+        effects=[slack],
+        conditions=("slow", "fast", "grasp"),
+        closures=6,
+        seed=11,
+        sensors="bench",
+    )
+    found = diagnosed(load_trials([write_set(tmp_path / "bags", conditions)]))
+    assert found.verdict == "effects" and [e.name for e in found.effects] == ["wire_slack"]
+    assert found.effects[0].parameters["slack"].value == pytest.approx(1.0, abs=0.3)
+
+
 def test_a_slow_closure_on_nothing_is_no_grasp_where_the_fast_one_brakes() -> None:
     """The fast hand's current falls before it arrives; the slow one's does not rise."""
     q = np.linspace(2.5, 12.5, 200)
