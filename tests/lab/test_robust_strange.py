@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hannes_bags.reading import read_bag
 from hannes_description.model import EffectEntry, Model
+from hannes_lab.calibrate import calibrate
 from hannes_lab.chance import chance
 from hannes_lab.diagnose import Diagnosis, _adequate, _short_of, diagnose, effect_sources
 from hannes_lab.executor import Executor
@@ -90,6 +91,12 @@ def test_a_strange_hand_may_rest_off_its_open_stop(tmp_path: Path) -> None:
     fitted = null()
     assert 0.5 < fitted.values["encoder.homing"] < 1.5
     assert friction_off(fitted) < 2.5 < 4.0 < friction_off(null(without="encoder.homing"))
+    held = [
+        w for w in calibrate(prepared, ["friction.coulomb"], starts=1).warnings if "hold the tolerances" in w
+    ]
+    assert held and "homing" not in held[0], (
+        "what the recordings do not tell is fitted beside what is calibrated"
+    )
     (said,) = (
         note for note in diagnose(prepared, effect_sources(only=["gravity"])).notes if "do not tell" in note
     )

@@ -674,7 +674,7 @@ def calibrate(
 
 def _of_the_recording(name: str) -> bool:
     """A nuisance parameter that says nothing of the hand."""
-    return "@" in name or name.startswith(("log.", "control."))
+    return "@" in name or name.startswith(("log.", "control.", "encoder."))
 
 
 def _key(problem: Problem) -> str:
