@@ -188,6 +188,7 @@ def test_one_hand_whose_zero_is_elsewhere_in_each_recording_explains_nothing(tmp
     assert len(zeros) == 3 and _adequate(search, null, limits)
     assert _adequate(search, moved([15.0, 15.0, 15.0]), limits)
     assert not _adequate(search, moved([0.0, 0.0, 15.0]), limits)
+    assert not _adequate(search, moved([0.0, 0.0, 7.5]), limits), "five from their mean"
     said = _short_of(search, moved([0.0, 0.0, 15.0]), limits)
     assert said == "encoder.zero differs between recordings of one hand by 10 times its tolerance"
 

@@ -61,7 +61,7 @@ _WIRE = "wire.stiffness"
 _UNKNOWN_WIRE_SD = 0.5
 """Width of its prior (of the logarithm): nobody measured it, and on an unknown object it counts with the object's."""
 
-_APART = 8.0
+_APART = 4.0
 """Standard deviations from the mean over the recordings: one hand whose open position, or clock, is elsewhere in each
 recording is no explanation, however well it fits."""
 
