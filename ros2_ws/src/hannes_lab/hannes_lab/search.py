@@ -204,12 +204,13 @@ class Search:
         """Fits of the base set plus one effect from each start, best first; a slow plant runs at their ends only.
 
         worth   penalised cost below which the set is of interest
-        short   a few steps only, with all derivatives of the base taken as constant, but afresh from the nominal
-                values; none ends early, since where nuisance parameters have taken over the effect, what straight lines
-                promise says little
+        short   a few steps only, with all derivatives of the base taken as constant; of the model as it is, from the
+                nominal values afresh, and none ends early: where nuisance parameters have taken over the effect, what
+                straight lines promise says little
         """
         model, coordinates = self.with_effects((*base.names, name))
-        worth = np.inf if short else worth - _penalty(coordinates)
+        first = short and not base.names
+        worth = np.inf if first else worth - _penalty(coordinates)
         found = []
         for start in starts:
             near = self.scan.nearer(start, base.fit)
@@ -233,7 +234,7 @@ class Search:
                 still = {c.name: at.get(c.name, 0.0) for c in coordinates if not c.prior}
                 still |= {c.name: near.point[c.name] for c in near.coordinates if c.prior}
                 # From far off the way is long, and bends: the model as it is has gone another one.
-                afresh = short and not base.names and near is self.scan.at_nominal(base.fit)
+                afresh = first and near is self.scan.at_nominal(base.fit)
                 ways += [(base.fit, at), (None if afresh else near, still)]
             for point, begin in ways:
                 known = (
