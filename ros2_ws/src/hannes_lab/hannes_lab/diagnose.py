@@ -380,6 +380,9 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
         round_ = _extended(choice.search, front, texts[size - 1], worth)
         if not round_:
             break
+        if size == 1 and _hard(choice, round_[0]):
+            again = search.thoroughly().extend(front, list(search.sources), "one effect, thoroughly", worth)
+            round_ = _best_of(round_, again)
         if enough and round_[0].penalised < worth and set(choice.best.names) < set(round_[0].names):
             # The set without it may find its way further down from there; what is left is the gain.
             choice = replace(choice, best=choice.search.without(round_[0], choice.best.names))
@@ -411,6 +414,16 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
             break
         front, far = [best, *near[1:]], [c for c in wide if c not in rivals]
     return _pruned(choice)
+
+
+def _hard(choice: _Choice, first: Candidate) -> bool:
+    """Whether effects must be tried thoroughly: the model as it is went far off, and the best effect explains too little.
+
+    Where the model has an error of its own, much is explained by what is wrong: then always, unless nothing is missing.
+    """
+    if choice.search.slow or not choice.best.pulled or choice.adequate:
+        return False
+    return bool(choice.search.problem.discrepancy) or not _adequate(choice.search, first, choice.limits)
 
 
 def _ended_early(size: int, left: float, best: Candidate, limits: Chance) -> str:
@@ -520,9 +533,14 @@ def _extended(search: Search, front: Sequence[Candidate], text: str, worth: floa
         bases = [search.fitted(tuple(sorted(p))) for p in left]
         extended |= set(left)
         better = search.extend(bases, names, f"{text}, exchanged", round_[0].penalised)
-        sets = {frozenset(c.names): c for c in sorted((*round_, *better), key=lambda c: -c.penalised)}
-        round_ = sorted(sets.values(), key=lambda c: c.penalised)
+        round_ = _best_of(round_, better)
     return round_
+
+
+def _best_of(some: Sequence[Candidate], others: Sequence[Candidate]) -> list[Candidate]:
+    """Each set once, as it was fitted best; best first."""
+    sets = {frozenset(c.names): c for c in sorted((*some, *others), key=lambda c: -c.penalised)}
+    return sorted(sets.values(), key=lambda c: c.penalised)
 
 
 def _worth_showing(

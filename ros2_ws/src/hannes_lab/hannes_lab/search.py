@@ -105,6 +105,7 @@ class Search:
 
     sources     effect name -> what load_effect takes (catalogue name or path.py:Class)
     before      the model as it is, fitted with the noise that was estimated before; where its fit starts from
+    thorough    a first effect is approached from the nominal values afresh, and given up later
     """
 
     problem: Problem
@@ -115,6 +116,7 @@ class Search:
     progress: Progress = silent
     rows: NDArray[np.bool_] | None = None
     before: Candidate | None = None
+    thorough: bool = False
     found: dict[Names, Candidate] = field(default_factory=dict)
     _nominal: dict[bytes, Fit] = field(default_factory=dict)
     _minima: dict[bytes, tuple[Fit, ...]] = field(default_factory=dict)
@@ -204,12 +206,12 @@ class Search:
         """Fits of the base set plus one effect from each start, best first; a slow plant runs at their ends only.
 
         worth   penalised cost below which the set is of interest
-        short   a few steps only, with all derivatives of the base taken as constant; of the model as it is, from the
-                nominal values afresh, and none ends early: where nuisance parameters have taken over the effect, what
-                straight lines promise says little
+        short   a few steps only, with all derivatives of the base taken as constant; in a thorough search, of the model
+                as it is, from the nominal values afresh, and none ends early: where nuisance parameters have taken over
+                the effect, what straight lines promise says little
         """
         model, coordinates = self.with_effects((*base.names, name))
-        first = short and not base.names
+        first = short and self.thorough and not base.names
         worth = np.inf if first else worth - _penalty(coordinates)
         found = []
         for start in starts:
@@ -320,9 +322,16 @@ class Search:
         return settle(self.problem, found, self.rows, moves=2)[1]
 
     def _known(self, candidate: Candidate) -> Candidate:
-        if candidate.fit.complete:
-            self.found[tuple(sorted(candidate.names))] = candidate
+        names = tuple(sorted(candidate.names))
+        if candidate.fit.complete and not (
+            names in self.found and self.found[names].penalised < candidate.penalised
+        ):
+            self.found[names] = candidate
         return candidate
+
+    def thoroughly(self) -> Search:
+        """The same search, with what was found, for a first effect that is hard to reach."""
+        return replace(self, thorough=True, _key="")
 
     def polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
         """Refit from the candidate's point with all derivatives taken afresh."""
@@ -527,7 +536,14 @@ class Search:
             for k in missing:
                 yield k, function(bare, *items[k])
             return
-        shared = (self.problem, self.model, tuple(self.nuisances), dict(self.sources), self.rows)
+        shared = (
+            self.problem,
+            self.model,
+            tuple(self.nuisances),
+            dict(self.sources),
+            self.rows,
+            self.thorough,
+        )
         work = [(function, items[k]) for k in missing]
         key = f"{next(_runs)} {id(self)} {os.getpid()} {time.time_ns()}"
         for number, (result, simulations, failures) in self.executor.run(
@@ -546,7 +562,13 @@ class Search:
         out = {}
         with suppress(NotPlain):
             self._key = self._key or content_hash(
-                code_hash(), self.problem, self.model, tuple(self.nuisances), dict(self.sources), self.rows
+                code_hash(),
+                self.problem,
+                self.model,
+                tuple(self.nuisances),
+                dict(self.sources),
+                self.rows,
+                self.thorough,
             )
             for k, item in enumerate(items):
                 out[k] = content_hash(self._key, function.__module__, function.__qualname__, item)
@@ -592,10 +614,17 @@ def _work(
     """One item in a worker, which keeps the search for the next ones: (result, simulations, failures)."""
 
     def build() -> Search:
-        problem, model, nuisances, sources, rows, points, minima = shared
+        problem, model, nuisances, sources, rows, thorough, points, minima = shared
         problem = replace(problem, rig=own(problem.rig), counts=Counts())
         return Search(
-            problem, model, nuisances, sources, rows=rows, _nominal=dict(points), _minima=dict(minima)
+            problem,
+            model,
+            nuisances,
+            sources,
+            rows=rows,
+            thorough=thorough,
+            _nominal=dict(points),
+            _minima=dict(minima),
         )
 
     search = _held.get(key, build)
