@@ -417,7 +417,7 @@ def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -
 
 
 def _hard(choice: _Choice, first: Candidate) -> bool:
-    """Whether effects must be tried thoroughly: the model as it is went far off, and the best effect explains too little.
+    """Whether effects must be tried thoroughly: the model as it is went far off, and no effect explains enough.
 
     Where the model has an error of its own, much is explained by what is wrong: then always, unless nothing is missing.
     """
