@@ -158,6 +158,11 @@ PATIENCE = 3.0
 """A search that is not worth it ends where so many more falls like the last one, of what it promises, would not do."""
 
 
+OFF_BOUND = 0.02
+"""Standard deviations from its bound at which a nuisance parameter starts: on the bound the first dozen steps would all
+be cut short by it."""
+
+
 class _NotWorth(Exception):
     """A search that leads to no cost that is worth its time."""
 
@@ -249,7 +254,8 @@ def fit(
     if not coordinates:
         r = problem.residual(model, {})
         return Fit(model, (), np.zeros(0), float(r[use] @ r[use]), r, np.zeros((r.size, 0)))
-    inside = np.clip(z0, bounds[0] + 1e-9, bounds[1] - 1e-9)
+    edge = np.where(priors > 0.0, OFF_BOUND, 1e-9)
+    inside = np.clip(z0, bounds[0] + edge, bounds[1] - edge)
     complete = True
     try:
         z = least_squares(

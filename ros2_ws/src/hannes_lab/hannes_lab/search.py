@@ -62,7 +62,7 @@ WHOLE = 25
 """Steps of a fit in closed loop: where more than REFIT extensions are to be told apart, of the others, and of the model
 as it is."""
 
-STARTS = 5
+STARTS = 4
 APART = 1.5
 """Further starts of the fit of the model as it is, and how far off, in standard deviations of the priors, where these
 are wide: the misfit of a closed loop whose gains, wire and object are not known has several minima."""
@@ -649,10 +649,15 @@ def _derivatives(found: Fit, of: Sequence[Coordinate] | None = None) -> dict[str
 
 
 def wide_starts(coordinates: Sequence[Coordinate]) -> list[dict[str, float]]:
-    """Where fits of the model as it is start: the nominal values, and others if some priors are wide."""
+    """Where fits of the model as it is start: the nominal values, and others if some priors are wide.
+
+    One that can only grow from its nominal value starts away from it too, with all else nominal: near its bound the
+    misfit may say that it should shrink.
+    """
     wide = [c.name for c in coordinates if c.wide]
+    grown = [{c.name: 1.0} for c in coordinates if c.wide and c.bounds[0] == 0.0]
     others = np.random.default_rng(0).uniform(-APART, APART, (STARTS if wide else 0, len(wide)))
-    return [{}, *(dict(zip(wide, (float(z) for z in row), strict=True)) for row in others)]
+    return [{}, *grown, *(dict(zip(wide, (float(z) for z in row), strict=True)) for row in others)]
 
 
 def other_minima(best: Fit, others: Sequence[Fit]) -> tuple[Fit, ...]:
