@@ -362,8 +362,10 @@ def main() -> int:
         todo = full_hand_cases()
     elif options.lugre:
         todo = lugre_cases()
+    elif options.wound:
+        todo = wound_cases()
     else:
-        todo = wound_cases() if options.wound else cases(options.tuning)
+        todo = cases(options.tuning)
     runs = Parallel(n_jobs=options.jobs, return_as="generator")(
         delayed(kept)(run_case, c, options.out / f"{c.key}.json") for c in todo
     )

@@ -263,14 +263,7 @@ class HandRig(PlantRig):
         plant.set("encoder.resolution", 0.0)
         return plant
 
-    def run(
-        self,
-        model: Model,
-        values: Mapping[str, float],
-        trial: Trial,
-        reference: Array,
-        before: Array | None = None,
-    ) -> Rollout:
+    def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
         """The rollout itself; gains of the controller and the clock of the reference may be among the values."""
         of_plant: dict[str, float] = {}
         gains: dict[str, float] = {}
@@ -295,7 +288,7 @@ class HandRig(PlantRig):
         _, controller, _ = self._plant(model, trial)
         if isinstance(controller, DoublePID):
             controller.parameters[:] = replace(controller.settings, **gains).to_array()
-        return super().run(model, of_plant, trial, _moved(reference, delay, lead, trial), before)
+        return self._run(model, of_plant, trial, _moved(reference, delay, lead, trial), before)
 
     def observed(
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array

@@ -292,6 +292,9 @@ def build_problem(
             e = np.concatenate([deviations[k] for k in own], axis=1)
             power, v = _estimate_scatter(e, jacobian, v)
         single = np.diag(v) + (jacobian * power) @ jacobian.T
+        blocks = [features.blocks[k] for k in own]
+        form = _own_error(blocks, rig, model)
+        fresh = all(features.trials[b.trial].fresh for b in blocks)
         for part, count in _parts(features, own, n):
             rows = np.concatenate(
                 [np.arange(features.slices[k].start + a, features.slices[k].start + b) for k, a, b in part]
@@ -299,25 +302,14 @@ def build_problem(
             if not rows.size:
                 continue
             covariance = single / count
-            blocks = [features.blocks[k] for k in own]
-            share = 1.0 if part[0][1] == 0 else _share_of_first(features, blocks)
-            own_error = share**2 * _own_error(blocks, rig, model)
+            # In the drift an error of the first closure alone counts; the form of the model is the same for the others.
+            share = 1.0 if part[0][1] == 0 else 0.0 if fresh else 0.5 / count
+            own_error = share**2 * form
             if own_error.any():
                 covariance = covariance + own_error
                 discrepancy.append((rows, np.asarray(np.linalg.cholesky(own_error), dtype=np.float64)))
             whitener.append((rows, np.linalg.cholesky(covariance)))
     return Problem(rig, features, tuple(whitener), tuple(deviations), counts or Counts(), tuple(discrepancy))
-
-
-def _share_of_first(features: Features, blocks: Sequence[Block]) -> float:
-    """With which weight an error of the first closure alone counts in the drift; 0 where all start from the same state.
-
-    The form of the model is the same for the others, and drops out of their differences.
-    """
-    if all(features.trials[b.trial].fresh for b in blocks):
-        return 0.0
-    ramp = np.linspace(-0.5, 0.5, blocks[0].n)
-    return float(0.5 / (ramp @ ramp))
 
 
 def _own_error(blocks: Sequence[Block], rig: Rig, model: Model) -> Array:

@@ -264,7 +264,11 @@ class PlantRig:
         """Signals by name, simulated afresh."""
         return self.logged(self.run(model, values, trial, reference), trial)
 
-    def run(
+    def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
+        """The rollout itself, with all that the plant can show."""
+        return self._run(model, values, trial, reference)
+
+    def _run(
         self,
         model: Model,
         values: Mapping[str, float],
@@ -272,7 +276,7 @@ class PlantRig:
         reference: Array,
         before: Array | None = None,
     ) -> Rollout:
-        """The rollout itself, with all that the plant can show; it starts from reset, or from where `before` leads."""
+        """The rollout from reset, or from where the reference `before` leads."""
         plant, controller, base = self._plant(model, trial)
         wanted = _wanted(model, values, trial)
         for name in set(base) - set(wanted):

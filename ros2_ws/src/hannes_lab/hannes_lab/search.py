@@ -323,9 +323,8 @@ class Search:
 
     def _known(self, candidate: Candidate) -> Candidate:
         names = tuple(sorted(candidate.names))
-        if candidate.fit.complete and not (
-            names in self.found and self.found[names].penalised < candidate.penalised
-        ):
+        known = self.found.get(names)
+        if candidate.fit.complete and (known is None or candidate.penalised <= known.penalised):
             self.found[names] = candidate
         return candidate
 
@@ -536,22 +535,20 @@ class Search:
             for k in missing:
                 yield k, function(bare, *items[k])
             return
-        shared = (
-            self.problem,
-            self.model,
-            tuple(self.nuisances),
-            dict(self.sources),
-            self.rows,
-            self.thorough,
-        )
         work = [(function, items[k]) for k in missing]
         key = f"{next(_runs)} {id(self)} {os.getpid()} {time.time_ns()}"
         for number, (result, simulations, failures) in self.executor.run(
-            _work, (*shared, self._nominal, self._minima), key, work
+            _work, (*self._shared, self._nominal, self._minima), key, work
         ):
             self.problem.counts.simulations += simulations
             self.problem.counts.failures += failures
             yield missing[number], result
+
+    @property
+    def _shared(self) -> tuple[Any, ...]:
+        """What the result of every item depends on."""
+        sources = dict(self.sources)
+        return (self.problem, self.model, tuple(self.nuisances), sources, self.rows, self.thorough)
 
     @property
     def _codec(self) -> Codec:
@@ -561,15 +558,7 @@ class Search:
         """Hash of all that an item's result depends on; none for items of which that cannot be told."""
         out = {}
         with suppress(NotPlain):
-            self._key = self._key or content_hash(
-                code_hash(),
-                self.problem,
-                self.model,
-                tuple(self.nuisances),
-                dict(self.sources),
-                self.rows,
-                self.thorough,
-            )
+            self._key = self._key or content_hash(code_hash(), *self._shared)
             for k, item in enumerate(items):
                 out[k] = content_hash(self._key, function.__module__, function.__qualname__, item)
         return out
