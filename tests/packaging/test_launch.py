@@ -14,6 +14,7 @@ from hannes_bringup.cli.run import LAUNCH_FILE, NODES
 from hannes_bringup.launch_file import read_arguments, read_launch_file
 from hannes_bringup.ros2_standin import find_command, launch_path, main, share_folder
 from hannes_description.errors import HannesError
+from patience import PATIENCE
 
 LAUNCH = launch_path("hannes_bringup", LAUNCH_FILE, os.environ)
 
@@ -185,14 +186,17 @@ time.sleep(60)
 """
 IMPATIENT = """
 import sys, hannes_bringup.processes as processes
-processes.GRACE_SIGINT = processes.GRACE_SIGTERM = 0.5
+processes.GRACE_SIGINT = processes.GRACE_SIGTERM = float(sys.argv.pop(1))
 from hannes_bringup.ros2_standin import main
 sys.exit(main())
 """
 
 
-def start_graph(tmp_path: Path, *executables: str) -> subprocess.Popen[str]:
-    """`hannes_ros2 launch` of a file with those executables, each of which prints "up" when it is ready."""
+def start_graph(tmp_path: Path, *executables: str, grace: float = 0.5) -> subprocess.Popen[str]:
+    """`hannes_ros2 launch` of a file with those executables, each of which prints "up" when it is ready.
+
+    grace  s that each has after a signal before it gets a harder one
+    """
     prefix = tmp_path / "prefix"
     environment = prefix_with(prefix, "some_package", good=GOOD, stubborn=STUBBORN, bad="raise SystemExit(3)")
     launch = prefix / "share" / "some_package" / "launch"
@@ -202,7 +206,7 @@ def start_graph(tmp_path: Path, *executables: str) -> subprocess.Popen[str]:
     ]
     write(launch, *({"node": node} for node in nodes))
     return subprocess.Popen(
-        [sys.executable, "-c", IMPATIENT, "launch", "some_package", "test.launch.yaml"],
+        [sys.executable, "-c", IMPATIENT, str(grace), "launch", "some_package", "test.launch.yaml"],
         env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -220,10 +224,10 @@ def assert_gone(stderr: str, count: int) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_stops_all_nodes_cleanly(tmp_path: Path, number: signal.Signals) -> None:
-    child = start_graph(tmp_path, "good", "good")
+    child = start_graph(tmp_path, "good", "good", grace=PATIENCE)
     assert [child.stdout.readline() for _ in range(2)] == ["up\n", "up\n"]
     child.send_signal(number)
-    _, stderr = child.communicate(timeout=20)
+    _, stderr = child.communicate(timeout=PATIENCE)
     assert child.returncode == 0, stderr
     assert "Traceback" not in stderr
     assert_gone(stderr, 2)
@@ -233,7 +237,7 @@ def test_a_node_that_will_not_stop_is_killed_and_reported(tmp_path: Path) -> Non
     child = start_graph(tmp_path, "stubborn")
     assert child.stdout.readline() == "up\n"
     child.send_signal(signal.SIGINT)
-    _, stderr = child.communicate(timeout=20)
+    _, stderr = child.communicate(timeout=PATIENCE)
     assert child.returncode == 1
     assert "SIGTERM" in stderr and "SIGKILL" in stderr
     assert_gone(stderr, 1)
@@ -241,7 +245,7 @@ def test_a_node_that_will_not_stop_is_killed_and_reported(tmp_path: Path) -> Non
 
 def test_a_node_that_fails_ends_the_graph(tmp_path: Path) -> None:
     child = start_graph(tmp_path, "good", "bad")
-    _, stderr = child.communicate(timeout=20)
+    _, stderr = child.communicate(timeout=PATIENCE)
     assert child.returncode == 1
     assert "[bad1] ended with exit code 3" in stderr
     assert_gone(stderr, 2)

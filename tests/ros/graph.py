@@ -14,6 +14,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from hannes_ros import topics
+from patience import PATIENCE
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -25,7 +26,6 @@ PROGRAMS = {
     "emg_reference": "hannes_control.emg_reference_node",
     "composed": "hannes_bringup.composed_node",
 }
-LONG = 30.0
 
 
 class NodeProcess:
@@ -56,12 +56,12 @@ class NodeProcess:
     def send(self, number: int) -> None:
         self.process.send_signal(number)
 
-    def wait(self, timeout: float = LONG) -> int:
+    def wait(self, timeout: float = PATIENCE) -> int:
         try:
             code = self.process.wait(timeout)
         except subprocess.TimeoutExpired:
             raise AssertionError(f"still running after {timeout} s: {self.output}") from None
-        self._reader.join(timeout=5.0)
+        self._reader.join(timeout=PATIENCE)
         return code
 
     def end(self) -> None:
@@ -130,7 +130,7 @@ class Peer:
     def say(self, name: str, data: bytes) -> None:
         self.publisher(name).publish(data)
 
-    def until(self, condition: Callable[[], bool], timeout: float = LONG, what: str = "") -> None:
+    def until(self, condition: Callable[[], bool], timeout: float = PATIENCE, what: str = "") -> None:
         """Spin until the condition holds."""
         end = monotonic() + timeout
         while not condition():

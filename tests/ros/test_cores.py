@@ -13,6 +13,7 @@ from hannes_ros.diagnostics import ERROR, OK, WARN, Rate, missed_level
 from hannes_ros.lockstep import Peers, StallWatch, TickJoin, samples_until
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.run import _node_rules
+from patience import PATIENCE
 
 
 # -- command gate ----------------------------------------------------------------------------------------------------
@@ -122,8 +123,9 @@ def test_loop_counts_the_periods_that_it_missed():
 
     loop = RealtimeLoop(0.005, step)
     loop.start()
-    assert enough.wait(10.0)
+    assert enough.wait(PATIENCE)
     loop.stop()
+    loop._thread.join(PATIENCE)
     assert loop.missed >= 9
     assert sum(calls) == len(calls) + loop.missed
     assert loop.error is None
@@ -135,7 +137,7 @@ def test_loop_hands_over_what_its_step_raises():
 
     loop = RealtimeLoop(0.001, step)
     loop.start()
-    loop._thread.join(5.0)
+    loop._thread.join(PATIENCE)
     assert str(loop.error) == "broken"
 
 

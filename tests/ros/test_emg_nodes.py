@@ -52,10 +52,11 @@ def test_source_follows_the_stamps_in_lockstep(peer):
 
 def test_source_plays_a_file_in_real_time(peer, tmp_path: Path):
     path = tmp_path / "emg.csv"
-    path.write_text("t_s,close,open\n" + "".join(f"{k / 300:.4f},{k},{-k}\n" for k in range(60)))
+    # At 100 Hz the queues hold 3 s: nothing is lost to a peer that this machine keeps waiting.
+    path.write_text("t_s,close,open\n" + "".join(f"{k / 100:.4f},{k},{-k}\n" for k in range(60)))
     peer.hear(*EMG)
-    with processes(NodeProcess("emg_source", file=path)):
-        peer.until(lambda: len(peer.heard["emg_extensor"]) > 100, what="samples")
+    with processes(NodeProcess("emg_source", file=path, rate=100)):
+        peer.until(lambda: all(len(peer.heard[name]) > 100 for name in EMG), what="samples")
     flexor = values(peer, "emg_flexor")
     played = flexor[: flexor.index(0.0, 1)] if flexor[0] != 0.0 else flexor
     assert all(b - a == 1.0 for a, b in pairwise(played) if b != 0.0)
@@ -109,6 +110,8 @@ def test_reference_in_real_time_replaces_what_is_not_finite(peer):
     with processes(NodeProcess("emg_reference")):
         for name in EMG:
             peer.matched(name)
+        # It answers whether or not it has found who listens: its report shows that it has.
+        peer.until(lambda: bool(peer.status("emg_reference")), what="a report")
         for k, sample in enumerate(samples):
             peer.say("emg_extensor", convert.float64_bytes(0.0))
             peer.say("emg_flexor", convert.float64_bytes(math.nan if k == 100 else sample))

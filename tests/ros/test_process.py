@@ -10,6 +10,7 @@ from time import monotonic, sleep
 
 import pytest
 from graph import PROGRAMS, NodeProcess, processes
+from patience import PATIENCE
 
 NODES = [name for name in PROGRAMS if name != "composed"]
 READY = {
@@ -59,7 +60,7 @@ def test_early_signals_end_quietly(ros_environment, delay):
     ]
     with processes(*nodes):
         for node, number in zip(nodes, (signal.SIGINT, signal.SIGTERM), strict=True):
-            end = monotonic() + 30.0
+            end = monotonic() + PATIENCE
             while not importing(node):
                 assert monotonic() < end
                 sleep(0.005)
@@ -144,9 +145,9 @@ def test_diagnostics_tell_rate_age_and_counts(peer):
 def test_a_process_that_is_stuck_with_the_interpreter_s_lock_leaves_by_its_deadline(code: int) -> None:
     stuck = (
         f"import ctypes; from hannes_ros.leave import leave_within; print('said'); leave_within(0.3, {code}); "
-        "ctypes.PyDLL(None).sleep(60)"
+        "ctypes.PyDLL(None).sleep(600)"
     )
     answer = subprocess.run(
-        [sys.executable, "-c", stuck], capture_output=True, text=True, timeout=30, check=False
+        [sys.executable, "-c", stuck], capture_output=True, text=True, timeout=PATIENCE, check=False
     )
     assert (answer.returncode, answer.stdout) == (code, "said\n"), answer.stderr

@@ -17,11 +17,11 @@ from hannes_sim.objects import RIGID_DYNAMOMETER
 from hannes_sim.rollout import rollout
 from hannes_stiffness.classifier import NOT_SURE, StiffnessClassifier, class_label
 from hannes_stiffness.features import extract
+from patience import PATIENCE
 
 pytestmark = pytest.mark.ros
 
 _START = "from hannes_stiffness.stiffness_node import main; main()"
-_SECONDS = 30.0
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ class Bench:
             self.health = {v.key: v.value for v in status.values} | {"message": status.message}
 
     def wait(self, condition):
-        end = time.monotonic() + _SECONDS
+        end = time.monotonic() + PATIENCE
         while not condition():
             assert time.monotonic() < end, (
                 f"waited in vain; health {self.health}, {len(self.classes)} answers"
@@ -103,7 +103,7 @@ class Bench:
 
     def end(self, number):
         self.process.send_signal(number)
-        output = self.process.communicate(timeout=_SECONDS)[0]
+        output = self.process.communicate(timeout=PATIENCE)[0]
         return self.process.returncode, output
 
     def close(self):
@@ -228,7 +228,7 @@ def test_a_wrong_parameter_is_one_line_and_exit_code_2(ros_environment, argument
         [sys.executable, "-c", _START, "--ros-args", "-p", argument],
         capture_output=True,
         text=True,
-        timeout=_SECONDS,
+        timeout=PATIENCE,
         check=False,
     )
     assert done.returncode == 2, done.stderr

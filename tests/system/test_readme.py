@@ -51,7 +51,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return user, run(find + add, user)
 
 
-def run(text: str, folder: Path, timeout: float = 250.0) -> str:
+def run(text: str, folder: Path, timeout: float = 800.0) -> str:
     """The block in a shell in which `hannes` is this environment's; it stops at the first command that fails."""
     script = f'hannes() {{ "{sys.executable}" -m hannes_bringup.cli "$@"; }}\nset -e\n{text}'
     answer = subprocess.run(

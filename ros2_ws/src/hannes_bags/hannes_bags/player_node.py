@@ -66,8 +66,9 @@ class PlayerNode(HannesNode, Node):
         self._p = p = declare(self, PlayerParameters)
         playlist = load_playlist(p.bag, topics=p.topics, start=p.start)
         self._schedule = Schedule(playlist, 0.0 if p.fast else p.rate, loop=p.loop)
-        self._outputs = {entry.name: self._publisher(entry) for entry in playlist.topics}
+        # First: who finds another topic, and looks for simulated time, finds this too.
         self._sim_clock: Publisher | None = topics.clock_publisher(self) if p.clock else None
+        self._outputs = {entry.name: self._publisher(entry) for entry in playlist.topics}
         self._began: float | None = None
         self._created = monotonic()
         self._clocked = 0.0

@@ -112,9 +112,6 @@ class MotorController(HannesNode, LifecycleNode):
 
         self._voltage = topics.publisher(self, "motor_voltage")
         topics.subscription(
-            self, "encoder_position", self._on_tick_state if self._lockstep else self._on_state
-        )
-        topics.subscription(
             self, "motor_current", self._on_tick_current if self._lockstep else self._on_current
         )
         # who records wants the reference on its topic, wherever it comes from
@@ -123,6 +120,10 @@ class MotorController(HannesNode, LifecycleNode):
             topics.subscription(
                 self, "reference_position", self._on_tick_reference if self._lockstep else self._on_reference
             )
+        # Last: hand_sim starts once it has found who hears this, who then hears the rest too.
+        topics.subscription(
+            self, "encoder_position", self._on_tick_state if self._lockstep else self._on_state
+        )
         self._peers = Peers(
             {
                 f"{p.subscribers} subscriber(s) of motor/voltage": (

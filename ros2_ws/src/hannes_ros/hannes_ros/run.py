@@ -30,7 +30,7 @@ _SPIN_S = 0.1
 _DELIVER_S = 4.0
 # Destroying a node takes milliseconds, but Fast DDS 2.14 may wait in it for ever for a thread of its own that has just
 # heard of another node (DomainParticipant::set_listener; once in 450 nodes, five of which started and ended at a time).
-_LEAVE_S = 10.0
+_LEAVE_S = 4.0
 
 
 def run_node(*names: str, executor: str = "events", argv: Sequence[str] | None = None) -> int:

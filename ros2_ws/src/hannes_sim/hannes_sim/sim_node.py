@@ -113,13 +113,16 @@ class HandSim(HannesNode, Node):
         self._health = Health("unexpected_commands")
 
         self._watch = StallWatch(p.command_timeout_ms / 1e3)
+        self._lockstep = p.clock == "lockstep"
+        self._clock_heard = False
+        if self._lockstep:
+            # First: who finds another topic, and looks for simulated time, finds this too.
+            self._sim_clock = topics.clock_publisher(self, self._on_clock_match)
         self._state = topics.publisher(self, "encoder_position", self._on_match)
         self._current = topics.publisher(self, "motor_current", self._on_match)
         self._joints = topics.publisher(self, "joint_positions")
         self._force = topics.publisher(self, "grip_force")
         self._last: tuple[bytes, bytes] = (b"", b"")
-        self._lockstep = p.clock == "lockstep"
-        self._clock_heard = False
         on_voltage = self._on_tick_voltage if self._lockstep else self._on_voltage
         self._voltage = topics.subscription(self, "motor_voltage", on_voltage)
         self._peers = Peers(
@@ -136,9 +139,7 @@ class HandSim(HannesNode, Node):
         self._diagnostics = Diagnostics(self, self._health, self._status)
         self._loop = RealtimeLoop(p.period, self._step)
         self.wall_timer(_CHECK_S, self._check_lockstep if self._lockstep else self._check_realtime)
-        if self._lockstep:
-            self._sim_clock = topics.clock_publisher(self, self._on_clock_match)
-        else:
+        if not self._lockstep:
             self._loop.start()
         held = "nothing" if p.object == "none" else f"a {p.object} object"
         self.get_logger().info(
