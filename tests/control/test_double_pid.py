@@ -1,12 +1,17 @@
 """The control law: limits, anti-windup, battery saver, and the same numbers compiled and in Python."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hannes_control.double_pid import N_STATES, DoublePID, DoublePIDParameters, control
 from hannes_control.reference import FULL_CLOSURE, half_sine, make_profile, ramp_hold, reversals
 from hannes_description.control_ports import C_CURRENT, C_PERIOD, C_POSITION, C_REFERENCE, N_CONTROL_INPUTS
 from hannes_description.errors import HannesError
+from hannes_description.model import Model
 from hannes_description.parameters import load_parameters
+from hannes_sim.factory import make_plant
+from hannes_sim.rollout import rollout
 
 
 @pytest.fixture
@@ -104,3 +109,24 @@ def test_an_identified_motor_does_not_change_the_controller() -> None:
     other = nominal.with_values({"motor.resistance": 1.7, "motor.inductance": 2e-4, "motor.kt": 0.018})
     assert DoublePIDParameters.from_parameters(other) == DoublePIDParameters.from_parameters(nominal)
     assert DoublePIDParameters.from_parameters(nominal).current_ki == pytest.approx(1.49 / 0.005)
+
+
+def test_an_outer_integral_takes_away_what_a_spring_leaves() -> None:
+    """A board whose outer loop integrates, on a hand that a spring pulls open: without, it stays short by i / kp."""
+    model = Model.load()
+    left = {}
+    for ki in (0.0, 2.0):
+        known = model.with_values({"control.ki": ki})
+        run = rollout(make_plant(known), DoublePID.of_model(known.parameters), np.full(3000, 10.0))
+        left[ki] = abs(10.0 - float(run.encoder_position[-1]))
+        assert np.abs(run.motor_current).max() <= 4.6
+    assert left[2.0] < 0.5 * left[0.0]
+
+
+def test_the_outer_integral_does_not_wind_up() -> None:
+    law = DoublePID(replace(DoublePID.of_model(load_parameters("hannes")).settings, ki=5.0))
+    for _ in range(3000):
+        law.update(100.0, 0.0, 0.0)
+        assert abs(law.current_reference) <= 4.6
+    after = [law.update(-1.0, 0.0, 0.0) and law.current_reference for _ in range(20)]
+    assert after[-1] < 0.0

@@ -86,7 +86,6 @@ def test_two_processes_give_the_same_numbers(kept: tuple[Diagnosis, Path], seria
     assert same(kept[0], serial) and kept[0].simulations == serial.simulations
 
 
-@pytest.mark.timeout(300)
 def test_a_dask_cluster_gives_the_same_numbers(cluster: str, prepared: Prepared, serial: Diagnosis) -> None:
     far = found_with(prepared, Executor(dask=cluster))
     assert same(far, serial) and far.simulations == serial.simulations
@@ -197,7 +196,6 @@ def run_hannes(words: list[str], cache: Path, **options: object) -> "subprocess.
     )
 
 
-@pytest.mark.timeout(600)
 def test_ctrl_c_in_the_first_round_and_the_same_command_goes_on(
     recordings: Path, serial: Diagnosis, tmp_path: Path
 ) -> None:

@@ -1,7 +1,9 @@
 """The lab on another machine: an adapter outside the packages, a mass in the loop of its own controller."""
 
+import itertools
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +15,11 @@ from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.rig import linear_unit, load_rig, scaled_effect, unit_factor
 from hannes_lab.screen import usable_effects
+from hannes_lab.search import Search
 from hannes_lab.spectrum import position_periods
 from hannes_lab.trials import find_moves
 from hannes_sim.effect import catalogue, load_effect
+from hannes_sim.factory import make_plant
 from hannes_sim.rollout import rollout
 from lab.single_mass_rig import reference, write_files
 
@@ -44,7 +48,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ripple = {"sine": 0.3, "cosine": 0.2, "period": PERIOD}
     model = model.with_effect(scaled_effect(load_effect("cogging"), sizes, True).entry(ripple))
     machine = rig([])
-    run = rollout(machine.plant(model, None), machine.controller(model, 1e-3), reference())
+    run = rollout(make_plant(model), machine.controller(model, 1e-3), reference())
     rng = np.random.default_rng(3)
     path = folder / "mass.npz"
     position = run.encoder_position + 2e-7 * rng.standard_normal(run.time.size)
@@ -167,3 +171,53 @@ def test_units_scale_by_dimension() -> None:
     for effect in catalogue().values():
         for p in scaled_effect(effect, tuple(sorted(sizes.items())), False).parameters:
             assert p.lower <= p.typical <= p.upper, f"{effect.name}.{p.name}"
+
+
+def test_what_the_table_shows_decides_whether_an_effect_joins(prepared: Prepared) -> None:
+    """The rule of --greedy, on the printed numbers: each effect takes 5 % of the mean square."""
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]), greedy=True)
+    errors = [fall.held_out_conditions for fall in found.falls[1:]]
+    assert len(errors) == 3
+    assert all(b**2 <= 0.95 * a**2 for a, b in itertools.pairwise(errors))
+
+
+def test_little_explained_is_unknown(prepared: Prepared) -> None:
+    """A ripple beside dry friction of five times its size: alone it is no answer, though the error falls."""
+    found = diagnose(prepared, effect_sources(only=["cogging", "command_delay"]), greedy=True)
+    assert found.verdict == "unknown" and "not in the catalogue" in found.summary
+    assert any("less than half would be an answer" in note for note in found.notes)
+
+
+def test_the_model_file_says_what_is_printed(prepared: Prepared, tmp_path: Path) -> None:
+    """Also where nothing was added: the file then holds the parameters with which the error was found."""
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction"]), greedy=True)
+    (effect,) = found.effects
+    (entry,) = Model.load(found.model.save(tmp_path / "mass.yaml")).effects
+    level, written = effect.parameters["level"], entry.parameters["level"]
+    assert (written.lower, written.upper) == pytest.approx((level.low, level.high))
+    alone = diagnose(prepared, effect_sources(only=["gear_backlash"]), greedy=True)
+    assert not alone.effects
+    assert alone.model.parameters.value("motor.armature") == alone.values["motor.armature"] != 2.0
+
+
+def test_bounds_of_a_users_own_effect_are_in_the_machines_units(prepared: Prepared) -> None:
+    file = Path(__file__).parent / "outside_effect.py"
+    own = load_effect(f"{file}:Worn")
+    assert prepared.rig.effect(own) is own
+    assert prepared.rig.effect(load_effect("coulomb_friction")).parameters[0].unit == "N"
+
+
+def test_what_moves_nothing_is_not_known(prepared: Prepared) -> None:
+    fit = Search(prepared.problem, prepared.model, prepared.nuisances, {}).null().fit
+    free = replace(fit.coordinates[0], prior=False)
+    column = np.zeros((fit.residual.size, 1))
+    blind = replace(
+        fit,
+        coordinates=(*fit.coordinates, free),
+        z=np.append(fit.z, 0.0),
+        jacobian=np.hstack([fit.jacobian, column]),
+    )
+    twin = replace(blind, jacobian=np.hstack([fit.jacobian, fit.jacobian[:, :1]]))
+    assert blind.sd()[:-1] == pytest.approx(fit.sd())
+    assert blind.sd()[-1] > 100.0
+    assert twin.sd()[0] > 0.5 * twin.sd()[-1] > 0.3, "only their sum is known, and the prior of one"

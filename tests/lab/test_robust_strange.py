@@ -66,7 +66,7 @@ def test_what_was_grasped_and_how_it_was_controlled_is_read_from_the_closures(tm
     seen = {t.name: t.options.get("object") for t in with_seen_objects(trials, Model.load())}
     assert seen["slow"] is None and seen["fast"] is None and seen["grasp"]["stiffness"] > 5e3
     loop = outer_loop(trials)
-    assert loop is not None and loop[0] == pytest.approx(0.5, rel=0.25)
+    assert loop is not None and loop.kp == pytest.approx(0.5, rel=0.25) and loop.ki == 0.0
     assert "sensors" not in read_bag(tmp_path / "bags" / "slow").metadata
 
 
@@ -193,7 +193,7 @@ def test_one_hand_whose_zero_is_elsewhere_in_each_recording_explains_nothing(tmp
     assert not _adequate(search, moved([0.0, 0.0, 15.0]), limits)
     assert not _adequate(search, moved([0.0, 0.0, 7.5]), limits), "five from their mean"
     said = _short_of(search, moved([0.0, 0.0, 15.0]), limits)
-    assert said == "encoder.zero differs between recordings of one hand by 10 times its tolerance"
+    assert said == "encoder.zero differs between recordings of one machine by 10 times its tolerance"
 
 
 def test_a_set_that_needs_a_hand_far_outside_the_tolerances_explains_nothing(tmp_path: Path) -> None:
@@ -215,3 +215,19 @@ def test_a_set_that_needs_a_hand_far_outside_the_tolerances_explains_nothing(tmp
     assert said.startswith("friction.coulomb would be ") and "9 times its tolerance off" in said, said
     assert "calibrate" in said
     assert _adequate(search, at("control.current_kp", 9.0), limits), "of this nothing is known beforehand"
+
+
+@pytest.mark.slow
+def test_an_outer_loop_that_integrates_is_seen_and_is_no_effect(tmp_path: Path) -> None:
+    conditions = signals_of_set(
+        model=Model.load().with_values({**STRANGE, "control.ki": 0.4}),
+        conditions=("slow", "grasp"),
+        closures=4,
+        seed=11,
+    )
+    trials = load_trials([write_set(tmp_path / "bags", conditions, late)])
+    loop = outer_loop(trials)
+    assert loop is not None and loop.ki == pytest.approx(0.4, rel=0.3)
+    found = diagnose(prepare(trials, Model.load()), effect_sources(only=["viscous_friction"]), max_effects=1)
+    assert found.values["control.ki"] == pytest.approx(0.4, rel=0.1)
+    assert found.verdict == "nothing"

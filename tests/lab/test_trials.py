@@ -37,6 +37,16 @@ def test_closures_are_found_and_share_a_condition() -> None:
     assert np.diff(starts) == pytest.approx(4.0, abs=0.01)
 
 
+def test_a_grip_may_be_held_for_longer_than_the_hand_rests() -> None:
+    """Rest is where the recording begins and ends, not where the reference is for most of the time."""
+    up = np.linspace(0.0, 12.5, 1500)
+    one = np.concatenate([up, np.full(2500, 12.5), up[::-1], np.zeros(600)])
+    trial = make_trial(recording(np.concatenate([np.zeros(900), *([one] * 6)]), 250.0))
+    assert len(trial.closures) == 6 and len(trial.conditions) == 1
+    assert trial.closures[0].start == pytest.approx(0.9, abs=0.1)
+    assert not any("cut off" in note for note in trial.notes)
+
+
 def test_two_speeds_in_one_bag_are_two_conditions() -> None:
     reference = np.concatenate([half_sine(3), half_sine(4, period=2.0)])
     trial = make_trial(recording(reference, 250.0, metadata={"condition": "mix"}))

@@ -2,8 +2,9 @@
 
 Thesis P12: outer P on the position error gives the current reference, limited to +-4.6 A (P11); inner PI on the
 current error gives the voltage, limited to +-12 V.  The outer loop needs damping: P alone rings with the rotor's
-inertia.  Battery saver: when the current stays above a threshold for a time, the outer gain drops to zero and dry
-friction holds the grip until the reference asks for less than the hand's position, or for more than before.
+inertia.  Boards whose outer loop integrates too have a gain for that; nominally it is 0.  Battery saver: when the
+current stays above a threshold for a time, the outer gain drops to zero and dry friction holds the grip until the
+reference asks for less than the hand's position, or for more than before.
 
 The law is one pure function, called by the node and, compiled, by the simulator's rollout.
 """
@@ -30,13 +31,24 @@ from numba import cfunc, types
 from numpy.typing import NDArray
 
 # Order of the parameters in the flat array = order of the fields of DoublePIDParameters.
-_KP, _DAMPING, _FILTER, _CURRENT_KP, _CURRENT_KI, _I_MAX, _U_MAX, _SAVER_I, _SAVER_T, _SAVER_RELEASE = range(
-    10
+_KP, _DAMPING, _FILTER, _CURRENT_KP, _CURRENT_KI, _I_MAX, _U_MAX, _SAVER_I, _SAVER_T, _SAVER_RELEASE, _KI = (
+    range(11)
 )
 
 # States
-_INTEGRAL, _LAST_POSITION, _VELOCITY, _STARTED, _SAVER_CLOCK, _SAVING, _SAVED_REFERENCE, _I_REF = range(8)
-N_STATES = 8
+_INTEGRAL, _LAST_POSITION, _VELOCITY, _STARTED, _SAVER_CLOCK, _SAVING, _SAVED_REFERENCE, _I_REF, _OUTER = (
+    range(9)
+)
+N_STATES = 9
+
+
+NEEDED = (
+    *(f"control.{n}" for n in ("kp", "damping", "velocity_filter", "current_kp", "current_ki")),
+    *(f"control.saver_{n}" for n in ("current", "time", "release")),
+    "motor.current_limit",
+    "supply.voltage",
+)
+"""Parameters of a model without which the law cannot be made."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +66,7 @@ class DoublePIDParameters:
     saver_time     s, battery saver: time above the threshold before the outer gain drops to zero
     saver_release  rad, battery saver: a reference that rises by this much closes further; one below the hand's position
                    opens it
+    ki             A/(rad.s), outer integral gain at the pulley
     """
 
     kp: float
@@ -66,6 +79,7 @@ class DoublePIDParameters:
     saver_current: float
     saver_time: float
     saver_release: float
+    ki: float = 0.0
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -86,6 +100,7 @@ class DoublePIDParameters:
         resistance) does not change them.  kp = L/tau and ki = R/tau cancel the winding's pole and give a closed current
         loop of time constant tau.
         """
+        parameters.require({"double_pid": NEEDED})
         c, m = parameters.values_of("control"), parameters.values_of("motor")
         return cls(
             kp=c["kp"],
@@ -98,6 +113,7 @@ class DoublePIDParameters:
             saver_current=c["saver_current"],
             saver_time=c["saver_time"],
             saver_release=c["saver_release"],
+            ki=c.get("ki", 0.0),
         )
 
     def to_array(self) -> NDArray[np.float64]:
@@ -107,8 +123,9 @@ class DoublePIDParameters:
 def control(x: Any, p: Any, s: Any) -> float:
     """One period of the law: voltage [V] from inputs x (control_ports), parameters p and states s.
 
-    Outer: i_ref = clamp(kp (reference - position) - damping velocity, +-current_limit); inner PI on i_ref - current
-    with conditional integration (the integrator stops when the output is clamped and the error would push further).
+    Outer: i_ref = clamp(kp e + ki (integral of e) - damping velocity, +-current_limit) of e = reference - position;
+    inner PI on i_ref - current.  Both with conditional integration: an integrator stops when its output is clamped and
+    the error would push further.  The battery saver empties the outer one.
     """
     dt = x[C_PERIOD]
     position = x[C_POSITION]
@@ -135,7 +152,12 @@ def control(x: Any, p: Any, s: Any) -> float:
         else:
             gain = 0.0
 
-    i_ref = gain * (x[C_REFERENCE] - position) - p[_DAMPING] * s[_VELOCITY]
+    away = x[C_REFERENCE] - position
+    outer = s[_OUTER] + p[_KI] * dt * away if s[_SAVING] == 0.0 else 0.0
+    i_ref = gain * away + outer - p[_DAMPING] * s[_VELOCITY]
+    if (i_ref > p[_I_MAX] and away > 0.0) or (i_ref < -p[_I_MAX] and away < 0.0):
+        outer = s[_OUTER]
+    s[_OUTER] = min(max(outer, -p[_I_MAX]), p[_I_MAX])
     i_ref = min(max(i_ref, -p[_I_MAX]), p[_I_MAX])
     s[_I_REF] = i_ref
     error = i_ref - x[C_CURRENT]

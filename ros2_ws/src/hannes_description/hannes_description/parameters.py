@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
@@ -133,6 +133,13 @@ class ParameterSet(Mapping[str, Parameter]):
     def value(self, name: str) -> float:
         """The value of one parameter in its unit."""
         return self[name].value
+
+    def require(self, needs: Mapping[str, Sequence[str]]) -> None:
+        """Raise one HannesError that names all parameters that are not there, by who needs them."""
+        missing = {who: [name for name in names if name not in self] for who, names in needs.items()}
+        said = [f"{', '.join(names)} ({who} cannot do without)" for who, names in missing.items() if names]
+        if said:
+            raise HannesError(f"{self.source}: missing parameters: {'; '.join(said)}.")
 
     def values_of(self, group: str) -> dict[str, float]:
         """All values of a group, by the name after the dot: `values_of("motor")["resistance"]`."""

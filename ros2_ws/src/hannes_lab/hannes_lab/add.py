@@ -83,7 +83,7 @@ def add_effects(
     limits = chance(prepared.problem, search.null().fit, {})
     falls = error_falls(prepared, search, best)
     return Addition(
-        with_provenance(fitted_model(prepared.model, search, best), prepared, falls),
+        with_provenance(fitted_model(prepared.model, search, best, limits), prepared, falls),
         found_effects(search, best, limits, falls),
         falls,
         data_used(prepared.features),

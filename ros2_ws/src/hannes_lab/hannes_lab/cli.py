@@ -32,7 +32,7 @@ from .diagnose import diagnose as diagnose_model
 from .executor import Executor, interruptible
 from .experiments import VISIBLE, Experiment
 from .own_effect import check_own_effects
-from .prepare import Prepared, load_trials, prepare
+from .prepare import Prepared, load_trials, prepare, read_trials
 from .rig import load_rig
 from .trials import UNITS
 
@@ -162,7 +162,7 @@ def _prepared(
     if machine and topics:
         raise HannesError("--topic is for bags; with --rig the adapter's reader says where the signals are.")
     trials = (
-        machine.read(bags)
+        read_trials(machine, bags)
         if machine
         else load_trials(bags, scale=factors, objects=given, topics=_topics(topics))
     )
@@ -322,7 +322,10 @@ def _show_comparison(result: Comparison) -> None:
         "The residual depends on: "
         + ", ".join(f"{d.variable} {100 * d.share:.0f} %" for d in result.depends_on)
     )
-    console.print(f"Overall error: {_number(result.overall)} times the repeatability between closures.")
+    if math.isfinite(result.overall):
+        console.print(f"Overall error: {_number(result.overall)} times the repeatability between closures.")
+    else:
+        console.print("Overall error: not known in repeatabilities, for no condition was repeated.")
     for note in result.notes:
         console.print(f"note: {note}", style="dim")
 
@@ -382,7 +385,7 @@ def diagnose(
     if json:
         _print_json(found.to_dict() | {"model_file": str(written) if written else None})
         return
-    _show_diagnosis(found)
+    _show_diagnosis(found, prepared.rig.machine)
     if written:
         typer.echo(f"Model file: {written}")
     _say_report(report)
@@ -392,7 +395,7 @@ def _after(prepared: Prepared, found: Diagnosis | Addition) -> Comparison:
     return compare_model(replace(prepared, model=found.model), values=found.values)
 
 
-def _show_diagnosis(found: Diagnosis) -> None:
+def _show_diagnosis(found: Diagnosis, machine: str) -> None:
     console = _console()
     console.print(f"[bold]{found.verdict.upper()}[/bold]  {found.summary}")
     for effect in found.effects:
@@ -403,7 +406,7 @@ def _show_diagnosis(found: Diagnosis) -> None:
                 f"  {name} = {_number(p.value)} {p.unit}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
             )
         console.print(f"  {effect.why}")
-    _show_falls(console, found)
+    _show_falls(console, found, machine)
     if found.ranking:
         console.print("\nRanking (part of the excess misfit that each effect explains alone):")
         for rank in found.ranking[:8]:
@@ -427,9 +430,9 @@ def _show_experiments(console: Console, experiments: Sequence[Experiment]) -> No
         )
 
 
-def _show_falls(console: Console, found: Diagnosis | Addition) -> None:
+def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> None:
     table = Table(
-        title="Error, in multiples of the repeatability between closures (1 = as good as the hand repeats)"
+        title=f"Error, in multiples of the repeatability between closures (1 = as good as the {machine} repeats)"
     )
     units = {s.signal: s.unit for fall in found.falls for s in fall.signals}
     signals = list(found.falls[-1].held_out_signals)
@@ -438,6 +441,8 @@ def _show_falls(console: Console, found: Diagnosis | Addition) -> None:
         table.add_column(name, justify="left" if name in ("model", "held-out conditions") else "right")
     for k, fall in enumerate(found.falls):
         conditions = ", ".join(f"{c} {_number(v, 3)}" for c, v in fall.by_condition.items())
+        if len(fall.by_condition) > 1:
+            conditions = f"{_number(fall.held_out_conditions, 3)} ({conditions})"
         table.add_row(
             ("+ " if k > 1 else "") + fall.added,
             _number(fall.train, 3),
@@ -494,7 +499,7 @@ def add(
             for n, p in effect.parameters.items()
         )
         console.print(f"[bold]{effect.title}[/bold]: {values}")
-    _show_falls(console, found)
+    _show_falls(console, found, prepared.rig.machine)
     console.print(f"Model file: {path}")
     _say_report(report)
 

@@ -6,7 +6,7 @@ Aligned closures, errors per signal and phase, the thesis' figures, and the resi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -140,23 +140,38 @@ def compare(
     predicted = features.closures(prepared.rig, model, values)
     contact = _contact(prepared, values)
     labels = [_labels(features, block, contact) for block in features.blocks]
-    errors = signal_errors(features, predicted)
+    titles = _titles(features)
+    errors = tuple(
+        replace(e, condition=title)
+        for e, title in zip(signal_errors(features, predicted), titles, strict=True)
+    )
     names = [prepared.rig.phases.get(name, name) for name in PHASES]
     return Comparison(
         model,
         fitted,
         errors,
         overall(errors),
-        _cells(features, predicted, labels, seed, names),
+        _cells(features, predicted, labels, seed, names, titles),
         tuple(
-            _overlay(features, b, p, lab, names)
-            for b, p, lab in zip(features.blocks, predicted, labels, strict=True)
+            replace(_overlay(features, b, p, lab, names), condition=title)
+            for b, p, lab, title in zip(features.blocks, predicted, labels, titles, strict=True)
         ),
         _metrics(features, predicted, labels) if prepared.rig.figures else (),
         residual_dependences(features, predicted),
         data_used(features),
         prepared.notes,
     )
+
+
+def _titles(features: Features) -> list[str]:
+    """Per block its condition's name, with the trial's where several trials have that condition."""
+    trials: dict[str, set[int]] = {}
+    for block in features.blocks:
+        trials.setdefault(block.condition, set()).add(block.trial)
+    return [
+        f"{b.condition} ({features.trials[b.trial].name})" if len(trials[b.condition]) > 1 else b.condition
+        for b in features.blocks
+    ]
 
 
 def _contact(prepared: Prepared, values: Mapping[str, float]) -> dict[int, tuple[Array, Array] | None]:
@@ -182,7 +197,8 @@ def _labels(
     features: Features, block: Block, contact: Mapping[int, tuple[Array, Array] | None]
 ) -> NDArray[np.int64]:
     trial = features.trials[block.trial]
-    closure = trial.of(block.condition)[min(1, len(trial.of(block.condition)) - 1)]
+    own = trial.of(block.condition)
+    closure = own[0 if trial.anew else min(1, len(own) - 1)]
     touching = contact[block.trial]
     mask: NDArray[np.bool_] | None = None
     if touching is not None:
@@ -196,10 +212,11 @@ def _cells(
     labels: list[NDArray[np.int64]],
     seed: int,
     names: Sequence[str],
+    titles: Sequence[str],
 ) -> tuple[Cell, ...]:
     rng = np.random.default_rng(seed)
     rows: list[dict[str, Any]] = []
-    for block, model, label in zip(features.blocks, predicted, labels, strict=True):
+    for block, model, label, title in zip(features.blocks, predicted, labels, titles, strict=True):
         e = block.measured - block.measured.mean(axis=0)
         residual = block.measured.mean(axis=0) - model.mean(axis=0)
         n = block.n
@@ -208,11 +225,12 @@ def _cells(
             if own.sum() < 3:
                 continue
             scatter = float(np.sqrt((e[:, own] ** 2).sum() / max(1, (n - 1) * own.sum())))
-            repeat = max(scatter, block.floor) if n > 1 else float("nan")
+            floor = block.floor_in(own)
+            repeat = max(scatter, floor) if n > 1 else float("nan")
             rmse = float(np.sqrt(((block.measured - model)[:, own] ** 2).mean()))
             seen = float((residual[own] ** 2).mean())
             p = float("nan")
-            if n >= 5 and block.floor > 0.0 and seen <= block.floor**2:
+            if n >= 5 and floor > 0.0 and seen <= floor**2:
                 p = 1.0  # the same closures again and again, and the model as near as can be told
             elif n >= 5:
                 # Means of randomly signed deviations: what the mean residual would be by scatter alone.
@@ -220,7 +238,7 @@ def _cells(
                 p = float((1 + ((draws**2).mean(axis=1) >= seen).sum()) / (1 + DRAWS))
             rows.append(
                 {
-                    "condition": block.condition,
+                    "condition": title,
                     "signal": block.signal,
                     "phase": name,
                     "unit": block.unit,

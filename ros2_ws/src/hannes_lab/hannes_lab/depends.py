@@ -48,10 +48,10 @@ def residual_dependences(features: Features, predicted: list[Array]) -> tuple[De
     for block, closures in zip(features.blocks, predicted, strict=True):
         residuals.setdefault(block.signal, []).append(block.measured - closures)
     signal = next((s for s in ("motor_current", "motor_effort") if s in residuals), next(iter(residuals)))
-    by = {(b.condition, b.signal): (b, c) for b, c in zip(features.blocks, predicted, strict=True)}
-    for condition in [b.condition for b in features.blocks if b.signal == signal]:
-        target, load = by[(condition, signal)]
-        place = by.get((condition, "encoder_position"))
+    by = {(b.trial, b.condition, b.signal): (b, c) for b, c in zip(features.blocks, predicted, strict=True)}
+    for trial, condition in [(b.trial, b.condition) for b in features.blocks if b.signal == signal]:
+        target, load = by[(trial, condition, signal)]
+        place = by.get((trial, condition, "encoder_position"))
         if place is not None:
             position = np.interp(target.phase, place[0].phase, place[1].mean(axis=0))
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,6 +17,7 @@ from .chance import Chance, chance
 from .depends import Dependence, residual_dependences
 from .errors import (
     SignalError,
+    condition_error,
     held_out_closures,
     held_out_condition_errors,
     overall,
@@ -42,7 +44,7 @@ ADEQUATE = 1.25
 approximation behind the critical value.  Where the model has an error of its own, whose width has room enough, 1."""
 
 WORTHWHILE = 0.05
-"""A further effect must remove at least this part of the cost, and of the error on held-out conditions."""
+"""A further effect must remove at least this part of the cost, or of the mean square error on held-out conditions."""
 
 OWN_ERROR_PART = 0.1
 """The same where the model has an error of its own, also within chance: its width is assumed, and it is not noise.
@@ -71,10 +73,14 @@ IMPLAUSIBLE = 8.0
 """Standard deviations of its prior at which a nominal parameter is called far off, and beyond which no set of effects
 that needs it there is adequate: an effect may fit well whose only merit is that it replaces what the model had."""
 
-NO_REPEATS = (
-    "There is one closure of each condition only: nothing could be held out, and how well the hand repeats itself is a "
-    "guess."
-)
+FITTED = "fitted by hannes"
+"""Source of the nominal parameters in a model that was fitted, with effects or without."""
+
+HALF = 0.5
+"""Effects that were added one after another are the answer where the error on held-out conditions, above the
+repeatability, falls to this part; where more is left, what is missing is something else."""
+
+NO_REPEATS = "There is one closure of each condition only: nothing could be held out, and the repeatability is a guess."
 
 MANY_FAILURES = 0.05
 """Part of the simulations that did not stay finite from which on their parameters are worth a look."""
@@ -134,6 +140,7 @@ class Fall:
 
     train, held_out   fitted on every second closure, judged on the others
     by_condition      error on each condition when it took no part in the fit
+    held_out_conditions  one number for them all (errors.condition_error); with `--greedy` it decides
     held_out_signals  the same per signal, root mean square over the conditions in the signal's unit
     """
 
@@ -143,6 +150,7 @@ class Fall:
     by_condition: Mapping[str, float]
     signals: tuple[SignalError, ...]
     held_out_signals: Mapping[str, float] = field(default_factory=dict)
+    held_out_conditions: float = math.nan
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -152,6 +160,7 @@ class Fall:
             "by_condition": dict(self.by_condition),
             "signals": [s.to_dict() for s in self.signals],
             "held_out_signals": dict(self.held_out_signals),
+            "held_out_conditions": self.held_out_conditions,
         }
 
 
@@ -282,13 +291,12 @@ def diagnose(
     )
     prepared = replace(prepared, problem=search.problem)
     nothing = not best.names and adequate
-    verdict = "nothing" if nothing else "effects" if adequate or (greedy and best.names) else "unknown"
+    verdict = "nothing" if nothing else "effects" if adequate or choice.enough else "unknown"
     tied = _ties(choice) if verdict == "effects" else ()
     falls = error_falls(prepared, search, best, in_order=greedy)
     if verdict == "unknown":
         best, falls = _worth_showing(search, best, falls)
     best = search.with_spread(best)
-    model = fitted_model(prepared.model, search, best) if best.names else prepared.model
     effects = found_effects(search, best, limits, falls)
     experiments = (
         separating_experiments(prepared, search, [search.found[tuple(sorted(n))] for n in tied])
@@ -308,7 +316,7 @@ def diagnose(
         ),
         chance=limits,
         costs={"nominal_fitted": null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
-        nuisances=_nuisance_table(best.fit),
+        nuisances=_nuisance_table(best.fit, limits),
         notes=(
             *prepared.notes,
             *choice.notes,
@@ -320,14 +328,17 @@ def diagnose(
         ),
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
-        model=model,
+        model=fitted_model(prepared.model, search, best, limits),
         values=best.fit.values,
     )
 
 
 @dataclass(frozen=True)
 class _Choice:
-    """The set that was chosen, the search (with its noise) in which it was judged, and its rivals of the same size."""
+    """The set that was chosen, the search (with its noise) in which it was judged, and its rivals of the same size.
+
+    enough   it removes most of the error on held-out conditions, though chance does not explain the rest
+    """
 
     search: Search
     best: Candidate
@@ -336,25 +347,33 @@ class _Choice:
     ranking: tuple[Rank, ...]
     rivals: tuple[Candidate, ...] = ()
     notes: tuple[str, ...] = ()
+    enough: bool = False
 
 
 def _grow(search: Search, null: Candidate, limits: Chance, max_effects: int) -> _Choice:
-    """Effects one after another while the error on held-out conditions falls by at least WORTHWHILE."""
+    """Effects one after another while the mean square error on held-out conditions falls by at least WORTHWHILE."""
     if len(search.problem.features.conditions) < 2:
         raise HannesError(
             "--greedy judges by conditions that took no part in the fit, and there is one condition only: record "
-            "another speed or a grasp, or leave --greedy out."
+            "another speed or load, or leave --greedy out."
         )
     grown = grow(search, null, max_effects, WORTHWHILE)
     adequate = _adequate(search, grown.best, limits)
     ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits.median)) for c in grown.first)
     notes = list(grown.notes)
-    if not adequate:
+    first, last = grown.errors[0], grown.errors[-1]
+    enough = bool(grown.best.names) and last - 1.0 <= HALF * (first - 1.0)
+    if enough and not adequate:
         notes.append(
             f"the {_short_of(search, grown.best, limits)}: something smaller is left that the "
             "catalogue does not explain"
         )
-    return _Choice(search, grown.best, limits, adequate, ranking, grown.rivals, tuple(notes))
+    elif grown.best.names and not adequate:
+        notes.append(
+            f"what was added lowers the error on held-out conditions from {first:.3g} to {last:.3g} times the "
+            "repeatability; less than half would be an answer"
+        )
+    return _Choice(search, grown.best, limits, adequate, ranking, grown.rivals, tuple(notes), enough)
 
 
 def _choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -> _Choice:
@@ -461,7 +480,7 @@ def _apart(search: Search, candidate: Candidate) -> str:
         mean = sum(z for z, _ in own) / len(own)
         farthest = max(abs(z - mean) for z, _ in own)
         if any(abs(z - mean) > most for z, most in own):
-            return f"{family} differs between recordings of one hand by {farthest:.0f} times its tolerance"
+            return f"{family} differs between recordings of one machine by {farthest:.0f} times its tolerance"
     return ""
 
 
@@ -547,7 +566,10 @@ def _worth_showing(
     search: Search, best: Candidate, falls: tuple[Fall, ...]
 ) -> tuple[Candidate, tuple[Fall, ...]]:
     """Where something unknown is left, only those effects that lower the error on held-out closures are shown."""
-    keep = 1 + int(np.argmin([fall.held_out for fall in falls[1:]]))
+    errors = [fall.held_out for fall in falls[1:]]
+    if not np.isfinite(errors).any():
+        return best, falls
+    keep = 1 + int(np.nanargmin(errors))
     names = tuple(fall.added for fall in falls[2 : keep + 1])
     if len(names) == len(best.names):
         return best, falls
@@ -565,12 +587,12 @@ def _ties(choice: _Choice) -> tuple[tuple[str, ...], ...]:
     return (choice.best.names, *(c.names for c in sorted(choice.rivals, key=lambda c: c.penalised)))
 
 
-def fitted_model(model: Model, search: Search, best: Candidate) -> Model:
+def fitted_model(model: Model, search: Search, best: Candidate, limits: Chance) -> Model:
     """The model with fitted nuisance parameters and effects, as it goes into a file."""
     values = best.fit.values
     known = {n: v for n, v in values.items() if "@" not in n and n in model.parameters}
-    out = model.with_values(known, status="identified", source="fitted by hannes together with the effects")
-    intervals = intervals_of(best.fit, 1.0)
+    out = model.with_values(known, status="identified", source=FITTED)
+    intervals = intervals_of(best.fit, limits)
     for name in best.names:
         out = out.with_effect(_entry(search, name, values, intervals))
     return replace(out, plant=model.plant)
@@ -591,11 +613,14 @@ def _entry(
     )
 
 
-def intervals_of(found: Fit, inflate: float) -> dict[str, tuple[float, float]]:
-    """95 % intervals by name, from the curvature of the cost, inside the parameter's bounds."""
-    sd = np.sqrt(np.maximum(np.diag(found.covariance(inflate)), 0.0))
+def intervals_of(found: Fit, limits: Chance) -> dict[str, tuple[float, float]]:
+    """95 % intervals by name, from the curvature of the cost, inside the parameter's bounds.
+
+    Wider by as much as the misfit is larger than chance makes it.
+    """
+    inflate = max(1.0, found.cost / limits.median)
     out = {}
-    for c, z, s in zip(found.coordinates, found.z, sd, strict=True):
+    for c, z, s in zip(found.coordinates, found.z, found.sd(inflate), strict=True):
         ends = sorted((c.value(float(z - 1.96 * s)), c.value(float(z + 1.96 * s))))
         out[c.name] = (ends[0], ends[1])
     return out
@@ -603,8 +628,7 @@ def intervals_of(found: Fit, inflate: float) -> dict[str, tuple[float, float]]:
 
 def _found(search: Search, best: Candidate, name: str, limits: Chance, falls: Sequence[Fall]) -> FoundEffect:
     kind = search.effect(name)
-    inflate = max(1.0, best.fit.cost / limits.median)
-    intervals = intervals_of(best.fit, inflate)
+    intervals = intervals_of(best.fit, limits)
     at_end = {c.name for c in _at_end(best.fit)}
     parameters = {}
     for p in kind.parameters:
@@ -615,16 +639,25 @@ def _found(search: Search, best: Candidate, name: str, limits: Chance, falls: Se
             value, low, high, p.unit, f"{name}.{p.name}" not in at_end and high - low < 0.8 * span
         )
     step = next((k for k, f in enumerate(falls) if f.added == name), len(falls) - 1)
-    before = {(s.condition, s.signal): s for s in falls[step - 1].signals}
-    drops = sorted(falls[step].signals, key=lambda s: s.ratio - before[(s.condition, s.signal)].ratio)
-    s = drops[0]
-    b = before[(s.condition, s.signal)]
+    pairs = zip(falls[step - 1].signals, falls[step].signals, strict=True)
+    b, s = min(pairs, key=lambda pair: _change(*pair))
     why = (
-        f"Without it the model misses {s.signal} in '{s.condition}' by {b.rmse:.3g} {s.unit} ({b.ratio:.1f} times the "
-        f"repeatability), with it by {s.rmse:.3g} {s.unit} ({s.ratio:.2f} times). What it looks like: "
-        f"{kind.looks_like}."
+        f"Without it the model misses {s.signal} in '{s.condition}' by {_missed(b)}, with it by {_missed(s)}. What it "
+        f"looks like: {kind.looks_like}."
     )
     return FoundEffect(name, kind.title, effect_source(kind, search.sources[name]), parameters, why)
+
+
+def _change(before: SignalError, after: SignalError) -> tuple[float, float]:
+    """By how much an error changed, in multiples of the repeatability and, where that is not known, as a part."""
+    change = after.ratio - before.ratio
+    return (change if math.isfinite(change) else 0.0, after.rmse / max(before.rmse, 1e-300))
+
+
+def _missed(error: SignalError) -> str:
+    """An error in its unit and, where there are repeats, in multiples of the repeatability."""
+    ratio = f" ({error.ratio:.2f} times the repeatability)" if math.isfinite(error.ratio) else ""
+    return f"{error.rmse:.3g} {error.unit}{ratio}"
 
 
 def found_effects(
@@ -661,6 +694,8 @@ def error_falls(
             overall(nominal),
             {c: overall([e for e in nominal if e.condition == c]) for c in features.conditions},
             nominal,
+            per_signal(features, [nominal]),
+            condition_error(features, [nominal]),
         )
     ]
     steps: list[tuple[str, Candidate]] = [("nominal, fitted", search.null())]
@@ -691,11 +726,12 @@ def _fall_in_worker(search: Search, candidate: Candidate, values: Mapping[str, f
     held = held_out_condition_errors(problem, f.model, f.coordinates, f.z)
     by_condition = {condition: overall(own) for condition, own in held.items()}
     errors = signal_errors(features, features.closures(exact_rig(problem.rig), f.model, f.values))
-    return train, test, by_condition, errors, per_signal(features, held.values())
+    of_all = condition_error(features, held.values())
+    return train, test, by_condition, errors, per_signal(features, held.values()), of_all
 
 
-def _nuisance_table(found: Fit) -> dict[str, dict[str, Any]]:
-    intervals = intervals_of(found, 1.0)
+def _nuisance_table(found: Fit, limits: Chance) -> dict[str, dict[str, Any]]:
+    intervals = intervals_of(found, limits)
     return {
         c.name: {
             "value": c.value(float(z)),
@@ -765,9 +801,8 @@ def _undescribed(best: Candidate) -> list[str]:
 
 def _identifiability_notes(best: Candidate) -> list[str]:
     """What this data cannot tell: pairs of effect and nuisance parameters that move the data alike."""
-    cov = best.fit.covariance()
-    sd = np.sqrt(np.maximum(np.diag(cov), 1e-30))
-    correlation = cov / np.outer(sd, sd)
+    sd = best.fit.sd()
+    correlation = best.fit.covariance() / np.outer(sd, sd)
     notes = []
     for i, a in enumerate(best.fit.coordinates):
         for j in range(i):
@@ -781,7 +816,7 @@ def _identifiability_notes(best: Candidate) -> list[str]:
 
 
 def _moved_far(best: Candidate) -> str:
-    """A sentence on nominal parameters far from their values: this hand's, or an effect of the same form."""
+    """A sentence on nominal parameters far from their values: this machine's, or an effect of the same form."""
     far = [
         f"{c.name} {c.value(float(z)):.3g} {c.unit} instead of {c.value(0.0):.3g}"
         for c, z in zip(best.fit.coordinates, best.fit.z, strict=True)
@@ -790,7 +825,7 @@ def _moved_far(best: Candidate) -> str:
     if not far:
         return ""
     return (
-        f" But it takes {', '.join(far)}, far outside the tolerance: is the nominal model that of this hand, or is "
+        f" But it takes {', '.join(far)}, far outside the tolerance: is the nominal model that of this machine, or is "
         "there an effect of the same form?"
     )
 

@@ -150,9 +150,10 @@ def _open(rig: Rig, candidate: Candidate) -> list[Loose]:
 def _found(candidate: Candidate) -> list[Loose]:
     """The effects' parameters as they were found, with the standard deviations that the data leave them."""
     fit = candidate.fit
-    sds = np.sqrt(np.maximum(np.diag(fit.covariance()), 0.0))
     return [
-        (c, float(z), float(sd)) for c, z, sd in zip(fit.coordinates, fit.z, sds, strict=True) if not c.prior
+        (c, float(z), float(sd))
+        for c, z, sd in zip(fit.coordinates, fit.z, fit.sd(), strict=True)
+        if not c.prior
     ]
 
 

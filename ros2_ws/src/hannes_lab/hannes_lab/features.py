@@ -16,6 +16,7 @@ import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_sim.effect import load_effect
+from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
 from .rig import Rig
@@ -32,7 +33,8 @@ MIN_CLOSURES_FOR_DRIFT = 4
 EXACT = 1e-9
 FINEST = 1e-5
 """Of a signal's span.  Closures that differ by no more than the first are those of a simulator without noise, which
-repeats itself bit for bit; they are taken to be known by the second, as by a sensor of 17 bits."""
+repeats itself bit for bit; they are taken to be known by the second, as by a sensor of 17 bits, or as another machine's
+rig says (`finest`)."""
 
 MOST_SHIFT = 15
 """Ticks by which a closure may begin earlier or later than where its reference was seen to move."""
@@ -51,6 +53,7 @@ class Block:
     measured   (n, p) the closures on the phase grid
     before, after, weight   (n, p) samples [ticks of the simulation] and interpolation weight of each point
     compact    the same three for a simulation of the closures only that others repeat; None where that does not hold
+    finest     of the signal's span: scatter that is assumed where closures are all the same
     """
 
     trial: int
@@ -61,6 +64,7 @@ class Block:
     full: tuple[Index, Index, Array]
     compact: tuple[Index, Index, Array] | None
     unit: str = ""
+    finest: float = FINEST
 
     @property
     def n(self) -> int:
@@ -74,9 +78,13 @@ class Block:
     @property
     def floor(self) -> float:
         """Scatter that is assumed of closures that are all the same, in the signal's unit; 0 of others."""
+        return self.floor_in(slice(None))
+
+    def floor_in(self, phases: slice | NDArray[np.bool_]) -> float:
+        """The same of a part of the phases: a coarse sensor shows the same again and again while nothing moves."""
         span = float(np.ptp(self.measured))
-        same = self.n > 1 and float(np.ptp(self.alike, axis=0).max()) <= EXACT * span
-        return FINEST * span if same else 0.0
+        same = self.n > 1 and float(np.ptp(self.alike[:, phases], axis=0).max()) <= EXACT * span
+        return self.finest * span if same else 0.0
 
     @property
     def size(self) -> int:
@@ -109,6 +117,7 @@ class Features:
     blocks: tuple[Block, ...]
     ends: tuple[int | None, ...]
     slices: tuple[slice, ...] = field(default=())
+    _wanted: tuple[tuple[str, ...], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         at, slices = 0, []
@@ -116,6 +125,10 @@ class Features:
             slices.append(slice(at, at + block.size))
             at += block.size
         object.__setattr__(self, "slices", tuple(slices))
+        wanted: list[dict[str, None]] = [{} for _ in self.trials]
+        for block in self.blocks:
+            wanted[block.trial][block.signal] = None
+        object.__setattr__(self, "_wanted", tuple(tuple(names) for names in wanted))
 
     @property
     def size(self) -> int:
@@ -141,19 +154,58 @@ class Features:
         """Predicted closures (n, p) of every block."""
         memory = has_memory(model)
         runs: list[tuple[Mapping[str, Array], bool]] = []
-        for trial, end in zip(self.trials, self.ends, strict=True):
-            compact = end is not None and (trial.fresh or not memory)
+        for number, (trial, end) in enumerate(zip(self.trials, self.ends, strict=True)):
+            compact = end is not None and (trial.anew or not memory)
             reference = trial.reference[:end] if compact else trial.reference
             signals = rig.simulate(model, values, trial, reference)
+            check_simulated(signals, self._wanted[number], trial, reference.size, rig)
             runs.append((signals, compact and not _whole(signals, trial)))
-        return [
+        out = [
             block.predicted(runs[block.trial][0][block.signal], runs[block.trial][1]) for block in self.blocks
         ]
+        for block, closures in zip(self.blocks, out, strict=True):
+            if not np.isfinite(closures).all():
+                raise PlantDiverged(
+                    f"{_logged(rig)} makes '{block.signal}' of trial '{self.trials[block.trial].name}' NaN or infinite "
+                    f"in condition '{block.condition}': it must give finite numbers wherever the machine moves."
+                )
+        return out
 
     def predict(self, rig: Rig, model: Model, values: Mapping[str, float]) -> Array:
         """Features of the model (size,)."""
         closures = self.closures(rig, model, values)
         return np.concatenate([b.combine(c) for b, c in zip(self.blocks, closures, strict=True)])
+
+
+def _logged(rig: Rig) -> str:
+    return f"{type(rig).__name__}.logged"
+
+
+def check_simulated(
+    signals: Mapping[str, Array], wanted: Sequence[str], trial: Trial, ticks: int, rig: Rig
+) -> None:
+    """Raise HannesError where a rig does not give a number per tick for each signal that is compared.
+
+    ticks  of the reference; a rig may give the whole trial instead
+    """
+    who = f"{_logged(rig)}, trial '{trial.name}'"
+    if not isinstance(signals, Mapping):
+        what = "nothing (None)" if signals is None else f"a {type(signals).__name__}"
+        raise HannesError(f"{who}: it returned {what}; it must return a mapping of signals, name -> values.")
+    missing = [name for name in wanted if name not in signals]
+    if missing:
+        raise HannesError(
+            f"{who}: it gives no {', '.join(missing)}, which was recorded; it gives {', '.join(signals) or 'nothing'}. "
+            "Return what that logger shows of a simulation, under the name that the trial has, or leave the signal out "
+            "of the trial."
+        )
+    for name in wanted:
+        shape = np.shape(signals[name])
+        if not isinstance(signals[name], np.ndarray) or shape not in ((ticks,), (trial.reference.size,)):
+            raise HannesError(
+                f"{who}: it gives '{name}' as {type(signals[name]).__name__} of shape {shape}; it must be an array "
+                f"with one value for each of the {ticks} control periods."
+            )
 
 
 def _whole(signals: Mapping[str, Array], trial: Trial) -> bool:
@@ -166,9 +218,12 @@ def has_memory(model: Model) -> bool:
     return any(load_effect(effect.source or effect.name).memory for effect in model.effects)
 
 
-def build_features(trials: Sequence[Trial], signals: Sequence[str], points: int = MAX_PHASES) -> Features:
+def build_features(
+    trials: Sequence[Trial], signals: Sequence[str], points: int = MAX_PHASES, finest: float = FINEST
+) -> Features:
     """The operator for these trials and signals, with at most `points` phases to a closure.
 
+    finest  see Block
     Raises HannesError where no trial has any of the signals.
     """
     blocks: list[Block] = []
@@ -179,7 +234,7 @@ def build_features(trials: Sequence[Trial], signals: Sequence[str], points: int 
         for condition in trial.conditions:
             for signal in signals:
                 if signal in trial.signals:
-                    block = _block(trial, number, condition, signal, end, points)
+                    block = _block(trial, number, condition, signal, end, points, finest)
                     if block is not None:
                         blocks.append(block)
     if not blocks:
@@ -211,6 +266,14 @@ def compact_end(trial: Trial) -> int | None:
     return min(trial.reference.size, round(trial.closures[max(repeats)].stop / trial.period) + 60)
 
 
+def stands_for_all(trial: Trial) -> bool:
+    """False where parts begin anew, but a simulation of the first would not be one of the others."""
+    if not trial.anew:
+        return True
+    later = [c for c in trial.closures if 0.5 * (c.start + c.stop) > trial.parts[1].begin]
+    return not later or compact_end(trial) is not None
+
+
 def _same_place(trial: Trial, closure: Closure, like: Closure) -> int:
     """Tick at which the reference of a closure begins to be that of another one.
 
@@ -232,7 +295,7 @@ def _same_place(trial: Trial, closure: Closure, like: Closure) -> int:
 
 
 def _block(
-    trial: Trial, number: int, condition: str, signal: str, limit: int | None, most: int
+    trial: Trial, number: int, condition: str, signal: str, limit: int | None, most: int, finest: float
 ) -> Block | None:
     time, values = trial.signals[signal]
     closures = trial.of(condition)
@@ -285,6 +348,7 @@ def _block(
         stack(full),
         stack(compact) if compact else None,
         trial.unit(signal),
+        finest,
     )
 
 

@@ -15,6 +15,9 @@ from .problem import Coordinate, Problem
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+SINGULAR = 1e-12
+"""Least eigenvalue of the curvature, scaled to a diagonal of one, that is told from rounding."""
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -56,9 +59,22 @@ class Fit:
         return None
 
     def covariance(self, inflate: float = 1.0) -> Array:
-        """Covariance (k, k) of z from the curvature at the optimum, with the priors; pseudo-inverse where singular."""
-        prior = np.diag([1.0 if c.prior else 1e-6 for c in self.coordinates])
-        return np.asarray(np.linalg.pinv(self.jacobian.T @ self.jacobian + prior) * inflate, dtype=np.float64)
+        """Covariance (k, k) of z from the curvature at the optimum, with the priors.
+
+        What moves nothing, and what only moves with another, has a very large variance.
+        """
+        curvature = self.jacobian.T @ self.jacobian + np.diag(
+            [1.0 if c.prior else 1e-6 for c in self.coordinates]
+        )
+        # Columns differ by many orders of magnitude: scaled to one another first, none is lost to rounding.
+        unit = np.sqrt(np.diag(curvature))
+        sizes, along = np.linalg.eigh(curvature / np.outer(unit, unit))
+        inverse = (along / np.maximum(sizes, SINGULAR)) @ along.T
+        return np.asarray(inverse / np.outer(unit, unit) * inflate, dtype=np.float64)
+
+    def sd(self, inflate: float = 1.0) -> Array:
+        """Standard deviations (k,) of z, see covariance."""
+        return np.sqrt(np.diag(self.covariance(inflate)))
 
 
 def prior_weights(coordinates: Sequence[Coordinate]) -> Array:
@@ -127,9 +143,7 @@ def spread(found: Fit) -> dict[str, float]:
     out too narrow.
     """
     out = {}
-    for j, (c, z, sd) in enumerate(
-        zip(found.coordinates, found.z, np.sqrt(np.diag(found.covariance())), strict=True)
-    ):
+    for j, (c, z, sd) in enumerate(zip(found.coordinates, found.z, found.sd(), strict=True)):
         usual = abs(c.inside_step(float(z)))
         most = 1.0 if c.prior else WIDEST_LOG * usual if c.log else WIDEST
         out[c.name] = max(min(float(sd), most), smooth_step(c, float(z), found.jacobian[:, j]))

@@ -2,17 +2,16 @@
 
 Real residuals are correlated along the motion and never become noise, so that a test against chance does not stop.
 Here each round adds the effect with the least error on conditions that took no part in its fit, and the search stops
-when the next one would lower that error by less than a given part.
+when the next one would lower its mean square by less than a given part.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from .errors import held_out_condition_errors, per_signal, pooled_repeatability
+from .errors import condition_error, held_out_condition_errors
 from .search import Candidate, Search
 
 JUDGED = 3
@@ -42,29 +41,25 @@ class Grown:
     notes: tuple[str, ...]
 
 
-def held_out_error(search: Search, candidate: Candidate) -> float:
-    """Error on conditions that took no part in the fit, root mean square, in multiples of the repeatability.
+def held_out_error(search: Search, candidate: Candidate, quickly: bool = False) -> float:
+    """Error on conditions that took no part in the fit, in multiples of the repeatability; see errors.condition_error.
 
-    Errors of a signal are averaged over the conditions first, in its unit: a condition that happens to repeat well does
-    not count more.
-
-    The derivatives of the fit to all conditions serve for all refits: leaving one out moves the optimum little.
+    quickly   the derivatives of the fit to all conditions serve for all refits: leaving one out moves it little
     """
     fit = candidate.fit
-    known = {c.name: fit.jacobian[:, j] for j, c in enumerate(fit.coordinates)}
-    features = search.problem.features
+    known = {c.name: fit.jacobian[:, j] for j, c in enumerate(fit.coordinates)} if quickly else None
     errors = held_out_condition_errors(search.problem, fit.model, fit.coordinates, fit.z, known=known)
-    error = per_signal(features, errors.values())
-    repeats = pooled_repeatability(features)
-    ratios = [error[s] / repeats[s] for s in error if repeats[s] > 0.0]
-    return float(np.sqrt(np.mean(np.square(ratios)))) if ratios else float("nan")
+    return condition_error(search.problem.features, errors.values())
 
 
 def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grown:
-    """Add effects until the held-out error falls by less than `gain` (a part, such as 0.05) or none is left."""
+    """Add effects until the mean square of the held-out error falls by less than the part `gain`, or none is left.
+
+    The candidates of a round are compared quickly; whether the best of them joins is decided by refits of their own.
+    """
     best = null
     first: tuple[Candidate, ...] = ()
-    errors = [held_out_error(search, null)]
+    errors = [search.once(held_out_error, null, text="nominal: held-out conditions")]
     rivals: tuple[Candidate, ...] = ()
     notes: list[str] = []
     while len(best.names) < max_effects:
@@ -74,7 +69,7 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
             break
         first = first or tuple(singles)
         found = _judge(search, singles, text)
-        enough = 1.0 - gain
+        enough = math.sqrt(1.0 - gain)
         if not found.error <= enough * errors[-1] and len(best.names) + 2 <= max_effects:
             # Two effects may be worth it of which neither is alone.
             pairs = search.extend(singles[:JUDGED], list(search.sources), f"{text}, as a pair")
@@ -84,7 +79,7 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
         if not found.error <= enough * errors[-1]:
             notes.append(
                 f"the next effect, {found.best.names[-1]}, would change the held-out error from {errors[-1]:.2f} to "
-                f"{found.error:.2f}; a fall of {100 * gain:.0f} % is asked for: the search stops here"
+                f"{found.error:.2f}; its mean square must fall by {100 * gain:.0f} %: the search stops here"
             )
             break
         if rivals:
@@ -104,7 +99,7 @@ class _Judged:
 def _judge(search: Search, candidates: Sequence[Candidate], text: str) -> _Judged:
     """The best of the best fits by held-out error; of those that are alike, the one with the fewest parameters."""
     judged = search.each(_polish_in_worker, [(c,) for c in candidates[:JUDGED]], f"{text}: polish")
-    held = search.each(_held_in_worker, [(c,) for c in judged], f"{text}: held-out conditions")
+    held = search.each(held_out_error, [(c, True) for c in judged], f"{text}: held-out conditions")
     least = min(held)
     alike = [k for k in range(len(judged)) if held[k] <= (1.0 + ALIKE) * least]
     if not alike:
@@ -113,7 +108,8 @@ def _judge(search: Search, candidates: Sequence[Candidate], text: str) -> _Judge
         search.found[tuple(sorted(candidate.names))] = candidate
     winner = min(alike, key=lambda k: (len(judged[k].fit.coordinates), held[k]))
     rivals = tuple(judged[k] for k in sorted(alike, key=lambda k: held[k]) if k != winner)
-    return _Judged(judged[winner], float(held[winner]), rivals)
+    error = search.once(held_out_error, judged[winner], text=f"{text}: held-out conditions")
+    return _Judged(judged[winner], error, rivals)
 
 
 def _close_call(best: Candidate, rivals: Sequence[Candidate]) -> str:
@@ -123,7 +119,3 @@ def _close_call(best: Candidate, rivals: Sequence[Candidate]) -> str:
 
 def _polish_in_worker(search: Search, candidate: Candidate) -> Candidate:
     return search.polish(candidate, evaluations=POLISH_STEPS)
-
-
-def _held_in_worker(search: Search, candidate: Candidate) -> float:
-    return held_out_error(search, candidate)

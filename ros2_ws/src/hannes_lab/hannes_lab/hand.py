@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from hannes_control.double_pid import DoublePID
@@ -17,10 +17,10 @@ from hannes_sim.factory import make_plant
 from hannes_sim.measurement import Sensors, folded_mean, logger, sample_noise
 from hannes_sim.objects import GraspObject, named_object
 from hannes_sim.plant import Plant
-from hannes_sim.rollout import Rollout
+from hannes_sim.rollout import Rollout, step_of
 from numpy.typing import NDArray
 
-from .features import Block
+from .features import FINEST, Block
 from .rig import Nuisance, PlantRig, make_controller
 from .trials import Trial
 
@@ -37,11 +37,15 @@ _UNKNOWN_DAMPING_SD = 1.5
 _UNKNOWN_GAINS = {
     "control.kp": 0.2,
     "control.damping": 0.5,
+    "control.ki": 0.5,
     "control.current_kp": 1.2,
     "control.current_ki": 1.2,
 }
 """Gains of a controller that nobody described, with the widths of their priors (of the logarithm): the outer loop shows
-in the static error; of the inner one the thesis gives the order of magnitude."""
+in the static error; of the inner one the thesis gives the order of magnitude.  One that is 0 stays so."""
+
+INTEGRAL_SEEN = 0.6
+"""An outer loop has an integral if that leaves less than this part of what is left without."""
 
 WIDE_STEP = 0.1
 """Step of finite differences where the prior is wide: half of its width leads past every bend of the signals."""
@@ -150,12 +154,19 @@ class HandRig(PlantRig):
     """
 
     population = data_path("parameters", "population.yaml")
+    phases: Mapping[str, str] = {}
+    machine = "hand"
     figures = True
     experiments = True
 
     def __init__(self, trials: Sequence[Trial]) -> None:
         super().__init__(trials)
         self._sensors = {trial.name: sensors_of(trial) for trial in self.trials}
+
+    @property
+    def finest(self) -> float:
+        """See Rig."""
+        return FINEST
 
     @classmethod
     def read(cls, paths: Sequence[Path]) -> list[Trial]:
@@ -209,18 +220,20 @@ class HandRig(PlantRig):
         out: list[Nuisance] = []
         delay = lead = 0.0
         if strange and model.controller == "double_pid":
-            means = {name: model.parameters.value(name) for name in _UNKNOWN_GAINS}
+            means = {n: model.parameters.value(n) for n in _UNKNOWN_GAINS if n in model.parameters}
             seen = outer_loop(strange)
             if seen is not None:
-                kp, damping, delay = seen
+                delay = seen.delay
                 if delay < -LEAD_SEEN:
                     delay, lead = 0.0, -delay
                     out.append(Nuisance(REFERENCE_LEAD, lead, REFERENCE_DELAY_SD, False, unit="s"))
-                means |= {"control.kp": kp, "control.damping": damping}
+                means |= {"control.kp": seen.kp, "control.damping": seen.damping}
+                if seen.ki > 0.0:
+                    means["control.ki"] = seen.ki
             out += [
                 Nuisance(name, means[name], sd, True, unit=model.parameters[name].unit)
                 for name, sd in _UNKNOWN_GAINS.items()
-                if means[name] > 0.0
+                if means.get(name, 0.0) > 0.0
             ]
         other = [trial for trial in self.trials if not is_of(trial, model)]
         known = self._plant(model.without_effects(), other[0])[0].names if other else ()
@@ -259,7 +272,7 @@ class HandRig(PlantRig):
 
     def plant(self, model: Model, trial: Trial) -> Plant:
         """The plant with the trial's object, encoder quantiser off."""
-        plant = make_plant(model, object_of(trial))
+        plant = make_plant(model, object_of(trial), dt=step_of(trial.period))
         plant.set("encoder.resolution", 0.0)
         return plant
 
@@ -319,21 +332,41 @@ class HandRig(PlantRig):
         }
 
 
-def outer_loop(trials: Sequence[Trial]) -> tuple[float, float, float] | None:
-    """Gain [A/rad], damping [A.s/rad] and delay of the reference [s] of the outer loop, as the recordings show them.
+class OuterLoop(NamedTuple):
+    """Gain [A/rad], damping [A.s/rad], delay of the reference [s] and integral gain [A/(rad.s)] of the outer loop."""
 
-    While the inner loop keeps up, i = kp (r - tau r' - q) - kd q', whatever the motor drives; so r - q is linear in
-    i, q' and r'.  A negative tau is a controller that sees the reference's rate too (a derivative of the error).
-    Taken from the recording in which this holds best: in fast ones the voltage reaches its limit, and a logger of few
-    hertz that averages and rectifies lags behind the current.
+    kp: float
+    damping: float
+    delay: float
+    ki: float
+
+
+def outer_loop(trials: Sequence[Trial]) -> OuterLoop | None:
+    """The outer loop as the recordings show it.
+
+    While the inner loop keeps up, i = kp (r - tau r' - q) + ki S - kd q', whatever the motor drives, with S the
+    integral of r - q; so r - q is linear in i, q', r' and S, up to a constant for each closure (an encoder's zero, what
+    S was before).  A negative tau is a controller that sees the reference's rate too (a derivative of the error).
+    One law for all recordings, each counting as well as it follows such a law: in fast ones the voltage reaches its
+    limit, and a logger of few hertz that averages and rectifies lags behind the current.
     None where the recordings do not show it.
     """
-    found = [law for law in map(_outer_law, trials) if law is not None]
-    return min(found)[1] if found else None
+    tables = [table for table in map(_outer_rows, trials) if table is not None]
+    if not tables:
+        return None
+    rows = np.concatenate([table / max(_linear_law(table)[1], 1e-12) for table in tables])
+    (per_ampere, lag, delay), left = _linear_law(rows[:, [0, 1, 2, 4]])
+    per_past = 0.0
+    integrating, with_integral = _linear_law(rows)
+    if integrating[3] > 0.0 and with_integral < INTEGRAL_SEEN * left:
+        per_ampere, lag, delay, per_past = integrating
+    if per_ampere <= 0.0 or lag <= 0.0 or abs(delay) > 0.2:
+        return None
+    return OuterLoop(*(float(x) for x in (1.0 / per_ampere, lag / per_ampere, delay, per_past / per_ampere)))
 
 
-def _outer_law(trial: Trial) -> tuple[float, tuple[float, float, float]] | None:
-    """Part of r - q that the law of `outer_loop` leaves in one recording, and its gain, damping and delay."""
+def _outer_rows(trial: Trial) -> Array | None:
+    """(n, 5) i, q', r', -S and r - q of `outer_loop` where the hand moves, each less its mean over the closure."""
     if not {"motor_current", "encoder_position"} <= set(trial.signals):
         return None
     time, current = trial.signals["motor_current"]
@@ -342,27 +375,29 @@ def _outer_law(trial: Trial) -> tuple[float, tuple[float, float, float]] | None:
     width = max(1, round(_SMOOTHED / trial.period))
     reference = np.convolve(trial.reference, np.ones(width) / width, mode="same")
     rate = np.gradient(reference, trial.period)
+    past = np.cumsum(reference - np.interp(ticks, *trial.signals["encoder_position"])) * trial.period
     step = float(np.median(np.diff(time)))
     rows = []
     for closure in trial.closures:
         at = np.arange(closure.start, closure.stop, step)
-        position = np.interp(at, *trial.signals["encoder_position"])
         if at.size < 8:
             continue
+        position = np.interp(at, *trial.signals["encoder_position"])
         velocity = np.gradient(position, at)
-        r, dr = np.interp(at, ticks, reference), np.interp(at, ticks, rate)
+        r, dr, s = (np.interp(at, ticks, values) for values in (reference, rate, past))
         moving = (np.abs(velocity) if signed else velocity) > 0.1 * velocity.max()
-        rows.append(np.column_stack([np.interp(at, time, current), velocity, dr, r - position])[moving])
-    table = np.concatenate(rows) if rows else np.zeros((0, 4))
-    if table.shape[0] < 30:
-        return None
-    known, error = table[:, :3], table[:, 3]
-    solution, *_ = np.linalg.lstsq(known, error, rcond=None)
-    per_ampere, lag, delay = (float(x) for x in solution)
-    if per_ampere <= 0.0 or lag <= 0.0 or abs(delay) > 0.2:
-        return None
-    left = float(np.linalg.norm(error - known @ solution) / np.linalg.norm(error))
-    return left, (1.0 / per_ampere, lag / per_ampere, delay)
+        if moving.any():
+            own = np.column_stack([np.interp(at, time, current), velocity, dr, -s, r - position])[moving]
+            rows.append(own - own.mean(axis=0))
+    table = np.concatenate(rows) if rows else np.zeros((0, 5))
+    return table if table.shape[0] >= 30 else None
+
+
+def _linear_law(rows: Array) -> tuple[Array, float]:
+    """Least-squares solution (k,) of rows (n, k + 1), the last column by the others, and the norm of what is left."""
+    known, wanted = rows[:, :-1], rows[:, -1]
+    solution, *_ = np.linalg.lstsq(known, wanted, rcond=None)
+    return np.asarray(solution), float(np.linalg.norm(wanted - known @ solution))
 
 
 def _moved(reference: Array, delay: float, lead: float, trial: Trial) -> Array:

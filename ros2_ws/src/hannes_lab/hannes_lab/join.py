@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from .features import compact_end
+from .features import stands_for_all
 from .trials import Part, Trial, group_closures, stem_of
 
 Array = NDArray[np.float64]
@@ -56,7 +57,8 @@ def join_repeats(loaded: Sequence[Loaded]) -> list[Trial]:
     """The trials in their order, those that repeat the condition of an earlier one joined to it.
 
     Recordings are joined where each has fewer than ENOUGH closures, all of one condition, and they have the same kind,
-    signals, units and description (object, logger, pose), the same reference, and mean closures that are ALIKE.
+    signals, units and description (object, logger, pose), the same reference, and mean closures that are ALIKE.  What
+    is joined already stays as it is.  Whether each begins anew is said by the trials (`fresh`), or seen.
     """
     groups: list[list[Loaded]] = []
     for one in loaded:
@@ -65,8 +67,28 @@ def join_repeats(loaded: Sequence[Loaded]) -> list[Trial]:
             groups.append([one])
         else:
             group.append(one)
-    fresh = _fresh([[one.trial for one in group] for group in groups if len(group) > 1])
-    return [trial for group in groups for trial in _one_or_all(group, fresh)]
+    several = [[one.trial for one in group] for group in groups if len(group) > 1]
+    found = _fresh([trials for trials in several if not trials[0].fresh])
+    return [trial for group in groups for trial in _one_or_all(group, group[0].trial.fresh or found)]
+
+
+def join_trials(trials: Sequence[Trial]) -> list[Trial]:
+    """A rig's trials, joined as bags are: those that repeat a condition have its name in common."""
+    joined = join_repeats([Loaded(trial, trial.conditions[0]) for trial in trials])
+    apart: dict[str, list[str]] = {}
+    for trial in joined:
+        if len(trial.conditions) == 1 and len(trial.closures) < ENOUGH:
+            apart.setdefault(trial.conditions[0], []).append(trial.name)
+    said = [
+        f"{', '.join(names)} are of one condition, '{condition}', and are not taken together: their references or "
+        "signals differ, or it is not seen how each began; where each begins as the first does, their trials must say "
+        "so (fresh=True)"
+        for condition, names in apart.items()
+        if len(names) > 1
+    ]
+    first, *others = joined
+    told = tuple(note for note in said if note not in first.notes)
+    return [replace(first, notes=(*first.notes, *told)), *others]
 
 
 def _one_or_all(group: list[Loaded], fresh: bool | None) -> list[Trial]:
@@ -78,7 +100,7 @@ def _one_or_all(group: list[Loaded], fresh: bool | None) -> list[Trial]:
     first = _typical(trials)
     joined = _joined([group[first], *group[:first], *group[first + 1 :]], fresh=True)
     # Where the references do not match tick by tick, a simulation would go through them as if they were one.
-    return [joined] if compact_end(joined) is not None else trials
+    return [joined] if stands_for_all(joined) else trials
 
 
 def _fresh(groups: Sequence[Sequence[Trial]]) -> bool | None:
@@ -139,14 +161,19 @@ def _one_object(group: Sequence[Loaded]) -> bool:
 
 def _repeats(one: Loaded, other: Loaded) -> bool:
     a, b = one.trial, other.trial
-    if any(len(t.conditions) != 1 or len(t.closures) >= ENOUGH for t in (a, b)):
+    if any(len(t.conditions) != 1 or len(t.closures) >= ENOUGH or t.parts for t in (a, b)):
         return False
     options = [{k: v for k, v in t.options.items() if k != "object"} for t in (a, b)]
-    said = (one.kind, a.period, options[0], a.units, set(a.signals))
-    if said != (other.kind, b.period, options[1], b.units, set(b.signals)):
+    said = (one.kind, a.period, a.units, set(a.signals), a.fresh)
+    if said != (other.kind, b.period, b.units, set(b.signals), b.fresh) or not _same(*options):
         return False
     together = _joined([other, one])
     return len(together.conditions) == 1 and all(_alike(a, b, signal) for signal in a.signals)
+
+
+def _same(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether two descriptions are equal; a rig's may hold arrays."""
+    return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
 
 
 def _alike(a: Trial, b: Trial, signal: str) -> bool:
@@ -179,7 +206,7 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
     ]
     signals = {}
     for name in first.signals:
-        inside = [t.signals[name][0] >= (0.0 if k else -np.inf) for k, t in enumerate(trials)]
+        inside = [_inside(t, name, k == 0, k == len(trials) - 1) for k, t in enumerate(trials)]
         time = [t.signals[name][0][i] + b for t, i, b in zip(trials, inside, begins, strict=True)]
         values = [t.signals[name][1][i] for t, i in zip(trials, inside, strict=True)]
         signals[name] = np.concatenate(time), np.concatenate(values)
@@ -191,7 +218,7 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
         without = f"{usual:.2f} s without {names[ends_first]}, which ends early"
         said += f"; of each closure the first {length:.2f} s ({without})"
     numbers = [number for t in trials for number in range(len(t.closures))]
-    closures = group_closures(reference, first.period, spans, first.name, step)
+    closures = group_closures(reference, first.period, spans, first.conditions[0], step)
     ordinals = {start: number for (start, _), number in zip(spans, numbers, strict=True)}
     return replace(
         first,
@@ -206,6 +233,14 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
         ),
         fresh=fresh,
     )
+
+
+def _inside(trial: Trial, name: str, first: bool, last: bool) -> NDArray[np.bool_]:
+    """The samples of a signal that lie in no other recording once this one stands between two."""
+    time = trial.signals[name][0]
+    until = trial.reference.size * trial.period
+    inside: NDArray[np.bool_] = (first | (time >= 0.0)) & (last | (time < until))
+    return inside
 
 
 def _notes(trials: Sequence[Trial], names: Sequence[str]) -> list[str]:

@@ -31,7 +31,9 @@ def phase_of(
     at = closure.start + phase
     half = max(5.0 * trial.period, 0.02)
     reference = np.interp(at, time, trial.reference)
-    slope = (np.interp(at + half, time, trial.reference) - np.interp(at - half, time, trial.reference)) / (
+    last = trial.parts[1].begin - trial.period if trial.anew else np.inf  # beyond stands another recording
+    after, before = np.minimum(at + half, last), at - half
+    slope = (np.interp(after, time, trial.reference) - np.interp(before, time, trial.reference)) / (
         2.0 * half
     )
     inside = (time >= closure.start) & (time <= closure.stop)

@@ -12,15 +12,17 @@ import numpy as np
 from hannes_bags.reading import read_bag
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_sim.effect import call_own
 from scipy.special import ndtr
 
+from .adapter import check_trials, other_units
 from .features import Features, build_features
 from .fit import fit
 from .grasp import with_seen_objects
 from .hand import HandRig
-from .join import Loaded, join_repeats
+from .join import Loaded, join_repeats, join_trials
 from .problem import Problem, build_problem, nuisance_coordinate
-from .rig import Nuisance, PlantRig, Rig
+from .rig import Nuisance, PlantRig, Rig, check_parameters
 from .settle import settle
 from .surrogate import rig_for
 from .trials import SIGNALS, Closure, NoClosure, Trial, compared, stem_of, trial_of, unique_names
@@ -123,6 +125,11 @@ def load_trials(
     return [replace(first, notes=(*first.notes, *(f"left out: {why}" for why in left_out))), *others]
 
 
+def read_trials(rig: type[PlantRig], paths: Sequence[Path]) -> list[Trial]:
+    """Trials of the files that a rig's adapter reads, checked."""
+    return check_trials(call_own(f"{rig.__name__}.read", rig.read, paths), rig.__name__)
+
+
 def without_outliers(trial: Trial) -> Trial:
     """Leave out closures that are far from the others of their condition (at least five closures needed)."""
     kept: list[Closure] = []
@@ -143,7 +150,7 @@ def without_outliers(trial: Trial) -> Trial:
             )
         for closure, far in zip(closures, distance, strict=True):
             # What the others are simulated as stays: the most typical recording of those that begin anew.
-            needed = trial.fresh and closure.start < trial.parts[1].begin
+            needed = trial.anew and closure.start < trial.parts[1].begin
             (dropped if far > OUTLIER and not needed else kept).append(closure)
     if not dropped:
         return trial
@@ -169,17 +176,20 @@ def prepare(
     surrogate  search a slow plant through a fast one (surrogate.py); `rig` of the result is the exact one
     threads  among which the slow plant's simulations are divided while this process works alone
     """
+    if rig is not None:
+        trials = join_trials(check_trials(trials, (rig if isinstance(rig, type) else type(rig)).__name__))
     trials = [without_outliers(trial) for trial in trials]
     if rig is None:
         trials = with_seen_objects(trials, model)
     rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
+    check_parameters(rig, model)
     known = dict.fromkeys((*SIGNALS, "motor_effort", *(s for t in trials for s in t.signals)))
     present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
     unknown = [s for s in signals or () if s not in present]
     if unknown:
         there = dict.fromkeys(s for t in trials for s in t.signals)
         raise HannesError(f"No recording has the signal {', '.join(unknown)}; they have {', '.join(there)}.")
-    features = build_features(trials, present, rig.points)
+    features = build_features(trials, present, rig.points, rig.finest)
     nuisances = tuple(rig.nuisances(model))
     coordinates = [nuisance_coordinate(n) for n in nuisances]
     view = rig_for(rig, model, coordinates, threads) if surrogate else rig
@@ -189,12 +199,20 @@ def prepare(
     settled, found = settle(problem, found, moves=3)
     problem = build_problem(settled.rig, features, model, nuisances, found.values, problem.counts)
     notes = [f"{trial.name}: {note}" for trial in trials for note in trial.notes]
+    if not isinstance(rig, HandRig):
+        notes += other_units(rig, model, features)
+        if model.base == Model.base:
+            notes.append(
+                f"the parameters of model '{model.name}' are the Hannes hand's, for it names no others: give its model "
+                "file a line `parameters: FILE.yaml`"
+            )
     if len(features.conditions) < 2:
         notes.append(
-            "there is one condition only: what fits it may fail elsewhere; record another speed and a grasp"
+            "there is one condition only: what fits it may fail elsewhere; record another speed, and another load"
         )
     if not any(signal in present for signal in rig.drive_signals):
-        notes.append("no current is recorded: friction, torque constant and inertia are hard to tell apart")
+        drive = rig.drive_signals[0].removeprefix("motor_").replace("_", " ")
+        notes.append(f"no {drive} is recorded: friction, torque constant and inertia are hard to tell apart")
     if "encoder_position" not in present:
         notes.append(
             "no encoder position is recorded: sensor offsets, slack and backlash cannot be told apart"
@@ -203,7 +221,7 @@ def prepare(
         where = [trial.name for trial in trials if signal in trial.signals]
         if len(where) < len(trials):
             notes.append(f"{signal} is recorded only in {', '.join(where)}")
-    notes += drifts(features)
+    notes += drifts(features, rig.machine)
     few = [c for c in features.conditions if all(b.n < 5 for b in features.blocks if b.condition == c)]
     if few:
         notes.append(
@@ -212,7 +230,7 @@ def prepare(
     return Prepared(rig, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))
 
 
-def drifts(features: Features) -> list[str]:
+def drifts(features: Features, machine: str = "hand") -> list[str]:
     """A sentence for each condition whose closures change steadily from the first to the last.
 
     Mann-Kendall test of a signal's closures along their first principal component: scatter is by chance from closure to
@@ -236,6 +254,6 @@ def drifts(features: Features) -> list[str]:
             )
             out.append(
                 f"{condition}: the closures drift from the first to the last ({shares}), which the repeatability holds "
-                "as if it were chance: let the hand warm up or run in, then record again"
+                f"as if it were chance: let the {machine} warm up or run in, then record again"
             )
     return out

@@ -294,7 +294,7 @@ def build_problem(
         single = np.diag(v) + (jacobian * power) @ jacobian.T
         blocks = [features.blocks[k] for k in own]
         form = _own_error(blocks, rig, model)
-        fresh = all(features.trials[b.trial].fresh for b in blocks)
+        fresh = all(features.trials[b.trial].anew for b in blocks)
         for part, count in _parts(features, own, n):
             rows = np.concatenate(
                 [np.arange(features.slices[k].start + a, features.slices[k].start + b) for k, a, b in part]

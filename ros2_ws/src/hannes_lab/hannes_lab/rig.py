@@ -16,15 +16,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
-from hannes_control.double_pid import DoublePID
+from hannes_control import double_pid
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.parameters import read_yaml
-from hannes_sim.effect import EffectType, load_class
+from hannes_sim import reduced
+from hannes_sim.effect import EffectType, call_own, catalogue, load_class
 from hannes_sim.factory import make_plant
 from hannes_sim.plant import Plant
 from hannes_sim.ports import R_Q, R_QL
-from hannes_sim.rollout import Controller, Rollout, rollout
+from hannes_sim.rollout import Controller, Rollout, rollout, step_of
 from numpy.typing import NDArray
 
 from .trials import Trial
@@ -99,6 +100,7 @@ class Rig(Protocol):
     drive_signals  signals that tell force or torque of the drive
     phases    other names for the phases void, grasp, hold, opening, rest
     figures   True where the figures of a hand's closure (closing time, grip force ...) have a meaning
+    machine   what it is called in sentences
     experiments  True where `hannes record` can run the experiments that separate effects
     pooled    True: in a fit every sample of a signal counts the same, and the fit is of least square error.  For
               machines that repeat far better than any model will fit; the exact moments would rule the fit otherwise
@@ -113,8 +115,13 @@ class Rig(Protocol):
     approximate: bool
     figures: bool
     phases: Mapping[str, str]
+    machine: str
     experiments: bool
     without: Mapping[str, str]
+
+    @property
+    def finest(self) -> float:
+        """Scatter of closures that is assumed where a coarse sensor shows none, relative to the signal's span."""
 
     def nuisances(self, model: Model) -> Sequence[Nuisance]:
         """The uncertain nominal parameters with their priors."""
@@ -126,7 +133,7 @@ class Rig(Protocol):
         """
 
     def effect(self, kind: EffectType) -> EffectType:
-        """An effect of the catalogue with typical values, bounds and units for this machine."""
+        """An effect with typical values, bounds and units for this machine; a user's own has them already."""
 
     def simulate(
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
@@ -152,7 +159,7 @@ class PlantRig:
                  from REFERENCE_SIZES; effects are scaled by them
     linear       True where position is in m and the drive gives N: units are named so
     without      effects that have no meaning here, with the reason
-    floor, points, drive_signals, pooled, approximate, phases, figures, experiments  see Rig
+    floor, points, drive_signals, pooled, approximate, phases, machine, figures, experiments  see Rig
 
     Plants are built once per (model structure, trial) and then only re-parametrised.
     """
@@ -167,7 +174,8 @@ class PlantRig:
     drive_signals: tuple[str, ...] = ("motor_current", "motor_effort")
     pooled: bool = False
     approximate: bool = False
-    phases: Mapping[str, str] = {}
+    phases: Mapping[str, str] = {"void": "forward", "opening": "back"}
+    machine: str = "machine"
     figures: bool = False
     experiments: bool = False
     source: ClassVar[str] = ""
@@ -182,6 +190,11 @@ class PlantRig:
         # A class from a user's file cannot be imported by name in another process.
         return (_rebuild, (self.source or type(self), self.trials))
 
+    @property
+    def finest(self) -> float:
+        """See Rig; an adapter says it by `floor`."""
+        return self.floor
+
     def identity(self) -> tuple[Any, ...]:
         """What its simulations depend on beside the model: for the hash under which results are kept."""
         return (self.source or type(self), self.trials)
@@ -193,6 +206,11 @@ class PlantRig:
 
     def nuisances(self, model: Model) -> list[Nuisance]:
         """Priors from the file of tolerances, around the model's values."""
+        if not self.population:
+            raise HannesError(
+                f"{type(self).__name__} names no file of tolerances: give `population`, the path of a YAML file that "
+                "says which parameters are uncertain, and by how much."
+            )
         table = read_yaml(Path(self.population), "file of tolerances")
         return [self._nuisance(name, entry, model) for name, entry in table.items()]
 
@@ -215,6 +233,8 @@ class PlantRig:
 
     def effect(self, kind: EffectType) -> EffectType:
         """See Rig."""
+        if catalogue().get(kind.name) is not kind:
+            return kind
         sizes = tuple(sorted(self.sizes.items()))
         return scaled_effect(kind, sizes, self.linear)  # type: ignore[arg-type]  # a class is hashable
 
@@ -223,8 +243,11 @@ class PlantRig:
         return make_controller(model, period)
 
     def plant(self, model: Model, trial: Trial) -> Plant:
-        """The plant for one trial, encoder quantiser off: a fit needs signals that are smooth in the parameters."""
-        plant = make_plant(model)
+        """The plant for one trial, encoder quantiser off: a fit needs signals that are smooth in the parameters.
+
+        Its step divides the trial's control period.
+        """
+        plant = make_plant(model, dt=step_of(trial.period))
         if "encoder.resolution" in plant.names:
             plant.set("encoder.resolution", 0.0)
         return plant
@@ -251,7 +274,7 @@ class PlantRig:
         else:
             self._came_back = True
             signals = self.observed(model, values, trial, reference)
-            if not (self._came_back or trial.fresh) and reference.size < trial.reference.size:
+            if not (self._came_back or trial.anew) and reference.size < trial.reference.size:
                 signals = self.observed(model, values, trial, trial.reference)
             self._signals[key] = signals
             if len(self._signals) > REMEMBERED:
@@ -262,7 +285,11 @@ class PlantRig:
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
     ) -> dict[str, Array]:
         """Signals by name, simulated afresh."""
-        return self.logged(self.run(model, values, trial, reference), trial)
+        run = self.run(model, values, trial, reference)
+        signals: dict[str, Array] = call_own(
+            f"{type(self).__name__}.logged, trial '{trial.name}',", self.logged, run, trial
+        )
+        return signals
 
     def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
         """The rollout itself, with all that the plant can show."""
@@ -300,7 +327,12 @@ class PlantRig:
     def _plant(self, model: Model, trial: Trial) -> tuple[Plant, Controller, dict[str, float]]:
         key = self._key(model, trial)
         if key not in self._plants:
-            self._plants[key] = (self.plant(model, trial), self.controller(model, trial.period), {})
+            who = type(self).__name__
+            plant: Plant = call_own(f"{who}.plant", self.plant, model, trial)
+            law: Controller = call_own(f"{who}.controller", self.controller, model, trial.period)
+            _check_compiled(plant, f"The plant '{model.plant}'")
+            _check_law(law, trial.period, f"The control law '{model.controller}'")
+            self._plants[key] = (plant, law, {})
         return self._plants[key]
 
 
@@ -329,15 +361,57 @@ def _wanted(model: Model, values: Mapping[str, float], trial: Trial) -> dict[str
 def make_controller(model: Model, period: float) -> Controller:
     """The control law that a model file names."""
     if model.controller == "double_pid":
-        return DoublePID.of_model(model.parameters, period)
+        return double_pid.DoublePID.of_model(model.parameters, period)
     if ":" in model.controller:
         file, _, name = model.controller.rpartition(":")
-        law: Controller = load_class(file, name, "controller")(model.parameters, period)
+        kind = load_class(file, name, "controller")
+        law: Controller = call_own(f"{name}(parameters, period) in '{file}'", kind, model.parameters, period)
         return law
     raise HannesError(
         f"Model '{model.name}': unknown controller '{model.controller}'; valid are double_pid, or "
         "path.py:Class for your own."
     )
+
+
+def check_parameters(rig: Rig, model: Model) -> None:
+    """Raise one HannesError that names all parameters which the model's plant and control law lack."""
+    own_law = isinstance(rig, PlantRig) and type(rig).controller is not PlantRig.controller
+    needs = {
+        "the reduced plant": reduced.NEEDED if model.plant == "reduced" else (),
+        "the control law double_pid": double_pid.NEEDED
+        if model.controller == "double_pid" and not own_law
+        else (),
+    }
+    model.parameters.require(needs)
+
+
+def _check_compiled(made: Plant | Controller, what: str) -> None:
+    address = getattr(made, "address", None)
+    if not isinstance(address, int | np.integer) or address <= 0:
+        raise HannesError(
+            f"{what}: its address is {address!r}; it must be that of a compiled function, the "
+            "`.address` of a numba cfunc, which the class keeps."
+        )
+
+
+def _check_law(law: Controller, period: float, what: str) -> None:
+    """Refuse what compiled code would take for numbers without being ones, or what is not run at the trial's period."""
+    _check_compiled(law, what)
+    for name in ("parameters", "states"):
+        array = getattr(law, name, None)
+        if not isinstance(array, np.ndarray) or array.dtype != np.float64 or not array.flags.c_contiguous:
+            raise HannesError(
+                f"{what}: its `{name}` must be a numpy array of floats (float64, contiguous), which "
+                "the compiled law reads."
+            )
+    if not callable(getattr(law, "reset", None)):
+        raise HannesError(f"{what}: it needs `reset(self)`, which sets its states to the start.")
+    given = getattr(law, "period", None)
+    if not isinstance(given, int | float | np.number) or abs(given - period) > 1e-9 * period:
+        raise HannesError(
+            f"{what}: its period is {given!r} s, that of the trial {period:.6g} s; it must be the "
+            "one that it is made with."
+        )
 
 
 def load_rig(source: str) -> type[PlantRig]:

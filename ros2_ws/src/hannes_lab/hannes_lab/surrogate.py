@@ -21,7 +21,7 @@ from hannes_sim.effect import EffectType
 from numpy.typing import NDArray
 
 from .executor import own
-from .features import Block, compact_end, has_memory
+from .features import Block, check_simulated, compact_end, has_memory
 from .problem import Coordinate
 from .rig import Nuisance, PlantRig, Rig
 from .trials import Trial
@@ -63,10 +63,12 @@ class AnchoredRig:
         self._exacts = [exact]
         self._ends = ends or {trial.name: compact_end(trial) for trial in exact.trials}
         self.trials = exact.trials
-        self.floor, self.points, self.pooled = exact.floor, exact.points, exact.pooled
+        self.floor, self.finest = exact.floor, exact.finest
+        self.points, self.pooled = exact.points, exact.pooled
         self.approximate = True
         self.drive_signals, self.without = exact.drive_signals, exact.without
         self.phases, self.figures, self.experiments = exact.phases, exact.figures, exact.experiments
+        self.machine = exact.machine
         self._model, self._values = model, dict(values)
         self._anchor: Anchor = (model.sha256, *sorted(self._values.items()))
         self._slopes = dict(slopes or {})
@@ -157,6 +159,7 @@ class AnchoredRig:
 
     def _fast(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Array:
         run = self.exact.simulate(model.with_plant(FAST_PLANT), values, trial, reference)
+        check_simulated(run, tuple(trial.signals), trial, reference.size, self.exact)
         return np.array([run[name] for name in trial.signals])
 
     def _slow(self, wanted: Sequence[Wanted]) -> list[Array]:
@@ -195,7 +198,7 @@ class AnchoredRig:
         return repeated(self._corrections[key], trial, size)
 
     def _shortest(self, trial: Trial, reference: Array) -> Array:
-        whole = has_memory(self._model) and not trial.fresh
+        whole = has_memory(self._model) and not trial.anew
         return reference if whole else reference[: self._ends[trial.name]]
 
     def _learn(self, trial: Trial, reference: Array) -> None:

@@ -40,8 +40,15 @@ STRANGE_HOLD_RATE = 225.0
 that are filled by a smooth curve.  The second is for recordings that do not say how they were logged."""
 
 
+RESTS = 0.02
+HELD = 0.05
+"""A reference rests within this part of its span from its rest value, which it has for so large a part of the time."""
+
 LONGEST_GAP = 5.0
 """Steps of a signal without a sample that are bridged by interpolation."""
+
+EARLY = 0.1
+"""s that a closure may begin before its recording: the reference stands there."""
 
 
 class NoClosure(HannesError):
@@ -77,7 +84,8 @@ class Trial:
     options    what the plant must know of this recording (object, sensors, pose); the rig's adapter reads it
     units      units of signals whose unit is not that of UNITS
     parts      the recordings that it is joined of; empty if it is one
-    fresh      each part begins as the first does, whatever came before; else one goes on where another ended
+    fresh      each part, or the recording beside others that it is joined to, begins as the first does, whatever came
+               before; else one goes on where another ended
     """
 
     name: str
@@ -94,7 +102,13 @@ class Trial:
     fresh: bool = False
 
     def __post_init__(self) -> None:
-        if self.reference.ndim != 1 or self.reference.size < 2:
+        shape = np.shape(self.reference)
+        if len(shape) != 1:
+            raise HannesError(
+                f"Trial '{self.name}': the reference has the shape {shape}; it must be one row of numbers, one for "
+                "each control period."
+            )
+        if shape[0] < 2:
             raise HannesError(f"Trial '{self.name}': the reference is too short to be replayed.")
         if not self.closures:
             raise NoClosure(
@@ -114,9 +128,14 @@ class Trial:
         return tuple(closure for closure in self.closures if closure.condition == condition)
 
     @property
+    def anew(self) -> bool:
+        """True where parts begin as the first one does; a recording alone begins but once."""
+        return self.fresh and len(self.parts) > 1
+
+    @property
     def repeats(self) -> tuple[int, ...]:
         """For each closure the number of the one that it repeats, for a machine without memory."""
-        if not self.fresh:
+        if not self.anew:
             return tuple(min(k, 1) for k in range(len(self.closures)))
         # The first recording has the most closures; outliers may be missing.
         until = self.parts[1].begin
@@ -191,9 +210,16 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _rest_value(values: Array) -> float:
-    """The value at which the reference rests: the most frequent one, or the minimum of a reference that never rests."""
+    """The value at which the reference rests: the one at which it begins and ends, else the most frequent one.
+
+    A grip may be held for longer than the hand rests.  The minimum of a reference that never rests.
+    """
     rounded, counts = np.unique(np.round(values, 6), return_counts=True)
-    return float(rounded[np.argmax(counts)]) if counts.max() >= 0.05 * values.size else float(values.min())
+    near = RESTS * float(np.ptp(values))
+    at_ends = np.abs(rounded - values[0]) <= near
+    if abs(values[-1] - values[0]) <= near and counts[at_ends].max() >= HELD * values.size:
+        return float(rounded[at_ends][np.argmax(counts[at_ends])])
+    return float(rounded[np.argmax(counts)]) if counts.max() >= HELD * values.size else float(values.min())
 
 
 def find_closures(reference: Array, period: float, *, lead: float = 0.03) -> list[tuple[float, float]]:
@@ -207,7 +233,7 @@ def find_closures(reference: Array, period: float, *, lead: float = 0.03) -> lis
     span = float(np.ptp(reference))
     if span <= 0.0:
         return []
-    moving = np.abs(reference - _rest_value(reference)) > 0.02 * span
+    moving = np.abs(reference - _rest_value(reference)) > RESTS * span
     starts = [(first * period, last * period) for first, last in _runs(moving) if last - first >= 3]
     out = []
     for k, (first, last) in enumerate(starts):
@@ -335,13 +361,10 @@ def trial_of(recording: Recording, *, name: str | None = None, period: float = 1
     begin = max(float(t[0]) for t, _ in samples.values())
     end = min(float(t[-1]) for t, _ in samples.values())
     spans = find_closures(reference, period)
-    inside = [(a, min(b, end)) for a, b in spans if a >= begin - 0.1 and min(b, end) > a]
-    whole = [span for span in inside if not any(_gap(time, *span) for time, _ in samples.values())]
+    inside = [(a, min(b, end)) for a, b in spans if a >= begin - EARLY and min(b, end) > a]
+    whole = [span for span in inside if not any(has_gap(time, *span) for time, _ in samples.values())]
     if len(whole) < len(inside):
-        count = len(inside) - len(whole)
-        notes.append(
-            f"{_closures(count)} in which samples are missing {'is' if count == 1 else 'are'} left out"
-        )
+        notes.append(left_out(len(inside) - len(whole)))
     closures = group_closures(reference, period, whole, name, channel.period)
     cut = len(spans) - len(closures) - (len(inside) - len(whole))
     if cut:
@@ -371,7 +394,12 @@ def _closures(count: int) -> str:
     return f"{count} closure{'s' * (count != 1)}"
 
 
-def _gap(time: Array, start: float, stop: float) -> bool:
+def left_out(count: int) -> str:
+    """The note about closures with a gap in a signal."""
+    return f"{_closures(count)} in which samples are missing {'is' if count == 1 else 'are'} left out"
+
+
+def has_gap(time: Array, start: float, stop: float) -> bool:
     """True where a signal has no sample for longer than a few of its steps, and long enough to hide something."""
     steps = np.diff(time[(time >= start) & (time <= stop)])
     return not steps.size or float(steps.max()) > max(LONGEST_GAP * float(np.median(np.diff(time))), 0.05)
@@ -385,8 +413,8 @@ def stem_of(source: str) -> str:
     return (path.stem if path.suffix else path.name) or "recording"
 
 
-def unique_names(trials: Sequence[Trial]) -> list[Trial]:
-    """Conditions of different recordings get different names."""
+def unique_names(trials: Sequence[Trial], *, conditions: bool = True) -> list[Trial]:
+    """Trials with names of their own, by which plants and parameters are kept; their conditions with them, if asked."""
     taken: dict[str, int] = {}
     out = []
     for trial in trials:
@@ -394,9 +422,14 @@ def unique_names(trials: Sequence[Trial]) -> list[Trial]:
         taken[trial.name] = count + 1
         if count:
             new = f"{trial.name}#{count + 1}"
-            closures = tuple(
-                replace(c, condition=c.condition.replace(trial.name, new, 1)) for c in trial.closures
+            trial = replace(
+                trial,
+                name=new,
+                closures=tuple(
+                    replace(c, condition=c.condition.replace(trial.name, new, 1)) for c in trial.closures
+                )
+                if conditions
+                else trial.closures,
             )
-            trial = replace(trial, name=new, closures=closures)
         out.append(trial)
     return out

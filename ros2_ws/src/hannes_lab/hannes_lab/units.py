@@ -41,6 +41,12 @@ SAME_UNIT = 20.0
 FOLLOWS = (0.2, 1.5)
 """Range of the encoder over that of the reference that it follows, at least and at most; little where it is blocked."""
 
+STANDS = 0.05
+"""Range of an encoder over that of its reference up to which it does not move with or against it."""
+
+AGAINST = -0.5
+"""Correlation of encoder and reference below which they move against each other."""
+
 FREE = 0.7
 """The same in a free closure, at least: some recording must reach it before the encoder's unit is taken for another."""
 
@@ -251,30 +257,41 @@ def _rest(one: _One) -> tuple[float, float] | None:
     return at, at - float(reference[0])
 
 
+def follows(reference: tuple[Array, Array], encoder: tuple[Array, Array]) -> tuple[float, float] | None:
+    """Times the reference's range that an encoder goes over, and their correlation (0 where it hardly moves).
+
+    None where the reference stands still.
+    """
+    (rt, asked), (et, done) = reference, encoder
+    if et.size < 3 or _range(asked) == 0.0:
+        return None
+    times = _range(done) / _range(asked)
+    r = np.interp(et, rt, asked)
+    both = float(np.std(r) * np.std(done))
+    if times <= STANDS or both == 0.0:
+        return times, 0.0
+    return times, float(np.mean((r - r.mean()) * (done - done.mean()))) / both
+
+
 def _check_follows(one: _One) -> None:
-    (rt, reference), (et, encoder) = one.samples[REFERENCE], one.samples[ENCODER]
-    asked, done = one.asked, one.done
-    if asked == 0.0 or et.size < 3:
+    found = follows(one.samples[REFERENCE], one.samples[ENCODER])
+    if found is None:
         return
-    r = np.interp(et, rt, reference)
-    both = float(np.std(r) * np.std(encoder))
-    if (
-        done > 0.05 * asked
-        and both > 0.0
-        and float(np.mean((r - r.mean()) * (encoder - encoder.mean()))) < -0.5 * both
-    ):
+    times, correlation = found
+    asked, done = one.asked, one.done
+    if correlation < AGAINST:
         raise HannesError(
             f"{one.where}: encoder_position moves against reference_position: one of them has the other sign. Say "
             "--scale encoder_position=-1 (or --scale reference_position=-1)."
         )
-    if not FOLLOWS[0] <= done / asked <= FOLLOWS[1]:
+    if not FOLLOWS[0] <= times <= FOLLOWS[1]:
         ranges = [
             f"{name} goes over {size:.4g} rad"
             + (f" (after this program multiplied it by {f:.4g})" if (f := one.guessed.get(name)) else "")
             for name, size in ((ENCODER, done), (REFERENCE, asked))
         ]
         raise HannesError(
-            f"{one.where}: {', '.join(ranges)}; that is {done / asked:.3g} times as much, and an encoder that follows "
+            f"{one.where}: {', '.join(ranges)}; that is {times:.3g} times as much, and an encoder that follows "
             "its reference goes over about as much. Is one of them in another unit (rad, degrees, counts) or at "
             "another shaft (motor, pulley)? Give its factor to rad at the pulley: --scale SIGNAL=FACTOR."
         )

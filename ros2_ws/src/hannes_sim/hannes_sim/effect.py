@@ -7,6 +7,7 @@ import importlib.util
 import inspect
 import pkgutil
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -205,6 +206,27 @@ def load_effect(name_or_source: str) -> EffectType:
     return check_effect(effect, file)
 
 
+def reason(error: Exception) -> str:
+    """One line of what an error says; numba's, which are long, with what it is about and where."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    said = [line for line in lines if not line.startswith("Failed in nopython mode")]
+    where = next((f" ({line.rstrip(':')})" for line in lines[1:] if line.startswith('File "')), "")
+    return f"{type(error).__name__}: {(said or lines or [''])[0].rstrip('.')}{where}"
+
+
+def call_own(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """What a user's function gives; whatever it raises becomes one error that says where."""
+    try:
+        return function(*arguments)
+    except HannesError:
+        raise
+    except Exception as error:  # a user's code may raise whatever it likes
+        frames = traceback.extract_tb(error.__traceback__)[1:]
+        own = [frame for frame in frames if frame.filename == frames[0].filename]
+        where = f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
+        raise HannesError(f"{what} failed: {reason(error)}{where}.") from error
+
+
 def load_class(file: str, class_name: str, what: str) -> Any:
     """An attribute of a user's own Python file; the file is executed once per process."""
     path = Path(file).expanduser().resolve()
@@ -223,7 +245,7 @@ def load_class(file: str, class_name: str, what: str) -> Any:
             spec.loader.exec_module(module)
         except Exception as error:  # whatever a user's file raises is reported as one clear error
             del sys.modules[module_name]
-            raise HannesError(f"'{file}' cannot be imported: {type(error).__name__}: {error}.") from error
+            raise HannesError(f"'{file}' cannot be imported: {reason(error)}.") from error
     if not hasattr(module, class_name):
         names = ", ".join(
             c.__name__ for _, c in inspect.getmembers(module, inspect.isclass) if c.__module__ == module_name
@@ -238,11 +260,9 @@ def compile_effect(effect: EffectType) -> Any:
     try:
         return cfunc(EFFECT_SIGNATURE, cache=_cacheable(effect))(effect.contribute)
     except Exception as error:  # numba's errors are long; the user needs the effect and the reason
-        reason = str(error).strip().splitlines()
         raise HannesError(
-            f"Effect '{effect.name}': contribute(x, p, s, y) cannot be compiled: "
-            f"{type(error).__name__}: {reason[0] if reason else ''} (plain arithmetic, math functions "
-            "and the constants of hannes_sim.ports are allowed)."
+            f"Effect '{effect.name}': contribute(x, p, s, y) cannot be compiled: {reason(error)} "
+            "(plain arithmetic, math functions and the constants of hannes_sim.ports are allowed)."
         ) from error
 
 

@@ -200,6 +200,11 @@ _NAMES = {
 _OBJECT_NAMES = {"object.stiffness": _OBJECT_K, "object.damping": _OBJECT_B, "object.position": _OBJECT_AT}
 
 
+NEEDED = ("supply.voltage", "motor.kt", "motor.armature")
+"""Parameters without which nothing moves.  Where a model does not name the others, gear.ratio, gear.efficiency and
+motor.resistance are 1 and all else is 0."""
+
+
 class ReducedPlant:
     """The reduced plant of a model; see the module's docstring for its equations."""
 
@@ -233,6 +238,7 @@ class ReducedPlant:
 
         self.parameters[P_DT] = dt
         values = model.parameters
+        values.require({"the reduced plant": NEEDED})
         # A drive without a gearbox, or whose command is a current, need not name these.
         self.parameters[[P_RATIO, P_EFFICIENCY, P_RESISTANCE]] = 1.0
         for name, index in _NAMES.items():
@@ -242,6 +248,9 @@ class ReducedPlant:
             "control.motor_kt" if "control.motor_kt" in values else "motor.kt"
         )
         self._armature = values.value("motor.armature")
+        for name in (*NEEDED, "gear.ratio", "motor.resistance"):
+            if self.get(name) == 0.0:
+                raise HannesError(f"{values.source}: {name} is 0; the reduced plant cannot move so.")
         self._update_inertia()
         self.parameters[_OBJECT_AT] = NO_OBJECT
         if grasp is not None:
@@ -255,6 +264,8 @@ class ReducedPlant:
 
     def _update_inertia(self) -> None:
         self.parameters[P_INERTIA] = self._armature * self.parameters[P_RATIO] ** 2
+        if self.parameters[P_INERTIA] == 0.0:
+            raise PlantDiverged("motor.armature or gear.ratio is 0: the reduced plant has no inertia.")
 
     @property
     def names(self) -> tuple[str, ...]:

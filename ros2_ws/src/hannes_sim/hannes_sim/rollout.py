@@ -21,7 +21,7 @@ from numba import cfunc, njit
 from numpy.typing import NDArray
 
 from .native import CONTROL_SIGNATURE, call_advance, call_control
-from .plant import Plant
+from .plant import DEFAULT_DT, Plant
 from .ports import (
     N_JOINTS,
     N_READING,
@@ -158,8 +158,19 @@ def substeps_of(period: float, dt: float) -> int:
     """How many plant steps make a control period; they must divide."""
     steps = round(period / dt)
     if steps < 1 or abs(steps * dt - period) > 1e-9 * period:
-        raise HannesError(f"The control period {period} s is not a multiple of the plant's step {dt} s.")
+        raise HannesError(
+            f"The control period {period:g} s is not a multiple of the plant's step {dt:g} s: take a multiple, or make "
+            "the plant with a step that divides it, make_plant(model, dt=step_of(period))."
+        )
     return steps
+
+
+def step_of(period: float) -> float:
+    """The plant's step that divides a control period [s]: the usual one, or the next shorter one that does."""
+    steps = period / DEFAULT_DT
+    if abs(round(steps) * DEFAULT_DT - period) <= 1e-9 * period:
+        return DEFAULT_DT
+    return period / math.ceil(steps)
 
 
 def rollout(

@@ -1,0 +1,305 @@
+"""What a rig's adapter gives, checked where it enters the lab.
+
+An adapter is a user's own code: whatever is wrong with its recordings, its simulated signals or its control law becomes
+one error that says what, of which class, trial and signal, and what to do.  Nothing here knows that the machine is a
+hand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from hannes_description.errors import HannesError
+from hannes_description.model import Model
+from hannes_sim.plant import PlantDiverged
+from numpy.typing import NDArray
+
+from .features import Features, stands_for_all
+from .rig import Rig
+from .trials import EARLY, Closure, NoClosure, Part, Trial, has_gap, left_out, unique_names
+from .units import AGAINST, ENCODER, FOLLOWS, follows
+
+Array = NDArray[np.float64]
+Samples = tuple[Array, Array]
+
+OTHER_LENGTH = 2.0
+LENGTH = 1.1
+"""Times by which the reference and the signals may differ in length: more is another period, or time stamps that are
+not in seconds.  From the second on it is said."""
+
+FAR_OFF = 100.0
+"""Times that a signal and its simulation may differ in range; a guessed mass or friction makes for less."""
+
+SHORTEST = 3.0
+"""Control periods that a closure lasts at least."""
+
+
+def check_trials(found: object, rig: str) -> list[Trial]:
+    """The trials that an adapter's `read` returned, in plain arrays, closures with gaps left out.
+
+    rig   name of the adapter's class
+    Raises HannesError for whatever cannot be compared with a simulation.
+    """
+    given = [found] if isinstance(found, Trial) else found
+    if isinstance(found, Trial | str | Mapping) or not isinstance(given, Iterable):
+        raise HannesError(
+            f"{rig}.read returned {_kind(found)}; it must return a list of trials, one for each recording."
+        )
+    trials = list(given)
+    if not trials:
+        raise HannesError(
+            f"{rig}.read returned no trial: it found no recording in the files that were given."
+        )
+    strange = next((one for one in trials if not isinstance(one, Trial)), None)
+    if strange is not None:
+        raise HannesError(
+            f"{rig}.read returned a list with {_kind(strange)} in it; each must be a hannes_lab.trials.Trial."
+        )
+    kept: list[Trial] = []
+    without: list[str] = []
+    for trial in trials:
+        try:
+            kept.append(_checked(trial, f"{rig}, trial '{trial.name}'"))
+        except NoClosure as none:
+            without.append(f"left out: {none}")
+    if not kept:
+        raise NoClosure(without[0].removeprefix("left out: "))
+    return unique_names([replace(kept[0], notes=(*kept[0].notes, *without)), *kept[1:]], conditions=False)
+
+
+def _kind(value: object) -> str:
+    return "nothing (None)" if value is None else f"a {type(value).__name__}"
+
+
+def _checked(trial: Trial, where: str) -> Trial:
+    period = _period(trial.period, where)
+    reference = _numbers(trial.reference, f"{where}: the reference", "every control period needs one")
+    signals = _signals(trial.signals, where)
+    trial = replace(
+        trial, period=period, reference=reference, signals=signals, closures=_closures(trial, where)
+    )
+    _check_times(trial, where)
+    trial = _noticed(trial, where)
+    _check_parts(trial, where)
+    return trial
+
+
+def _period(period: object, where: str) -> float:
+    if isinstance(period, int | float | np.number) and math.isfinite(period) and period > 0.0:
+        return float(period)
+    raise HannesError(
+        f"{where}: its period is {period!r}; it must be the control period in seconds, above 0."
+    )
+
+
+def _numbers(values: object, what: str, hint: str) -> Array:
+    """A row of finite numbers."""
+    try:
+        row = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise HannesError(f"{what} must be a row of numbers, not {_kind(values)} ({error}).") from error
+    if row.ndim != 1:
+        raise HannesError(f"{what} has the shape {row.shape}; it must be one row of numbers.")
+    bad = np.flatnonzero(~np.isfinite(row))
+    if bad.size:
+        raise HannesError(
+            f"{what} has {bad.size} of {row.size} values that are no numbers (NaN or infinite), the first at sample "
+            f"{bad[0]}: {hint}."
+        )
+    return np.ascontiguousarray(row)
+
+
+def _signals(signals: object, where: str) -> dict[str, tuple[Array, Array]]:
+    if not isinstance(signals, Mapping) or not signals:
+        raise HannesError(
+            f"{where}: it has no signals, so nothing could be compared: give a mapping name -> (time, values)."
+        )
+    out = {}
+    for name, given in signals.items():
+        if not isinstance(given, Sequence) or isinstance(given, str) or len(given) != 2:
+            raise HannesError(f"{where}: the signal '{name}' must be a pair (time, values).")
+        hint = "leave such samples out in `read`, with their time stamps, or fill them"
+        time = _numbers(given[0], f"{where}: the time of '{name}'", hint)
+        values = _numbers(given[1], f"{where}: the signal '{name}'", hint)
+        if time.size != values.size:
+            raise HannesError(
+                f"{where}: the signal '{name}' has {time.size} time stamps and {values.size} values; each value needs "
+                "its time stamp."
+            )
+        if time.size < 2:
+            raise HannesError(
+                f"{where}: the signal '{name}' has {time.size} sample; nothing can be compared."
+            )
+        back = np.flatnonzero(np.diff(time) < 0.0)
+        if back.size:
+            k = int(back[0])
+            raise HannesError(
+                f"{where}: the time stamps of '{name}' go back from {time[k]:.6g} to {time[k + 1]:.6g} s at sample "
+                f"{k + 1}: sort the samples by time."
+            )
+        out[str(name)] = (time, values)
+    return out
+
+
+def _closures(trial: Trial, where: str) -> tuple[Closure, ...]:
+    """The closures, each with its number in its own recording."""
+    closures = tuple(trial.closures)
+    for number, closure in enumerate(closures):
+        if not isinstance(closure, Closure):
+            raise HannesError(
+                f"{where}: closure {number + 1} is {_kind(closure)}; give Closure(start, stop, condition)."
+            )
+        if not closure.stop - closure.start >= SHORTEST * trial.period * (1.0 - 1e-9):
+            raise HannesError(
+                f"{where}: closure {number + 1} ('{closure.condition}') runs from {closure.start:.6g} to "
+                f"{closure.stop:.6g} s; it must stop later than it starts, by {SHORTEST:.0f} control periods of "
+                f"{trial.period:.6g} s at least."
+            )
+    begins = np.array([part.begin for part in trial.parts])
+    if begins.size and not (np.diff(begins) > 0.0).all():
+        raise HannesError(f"{where}: its parts must begin one after the other.")
+    # A closure's middle tells its part: it may begin a moment before.
+    of = [int(np.searchsorted(begins, 0.5 * (c.start + c.stop), side="right")) for c in closures]
+    if len({(c.number, part) for c, part in zip(closures, of, strict=True)}) == len(closures):
+        return closures
+    return tuple(replace(c, number=of[:k].count(of[k])) for k, c in enumerate(closures))
+
+
+def _check_times(trial: Trial, where: str) -> None:
+    """Reference, signals and closures have one time."""
+    period, end = trial.period, (trial.reference.size - 1) * trial.period
+    hint = f"are time stamps in seconds from the start of the reference, and is its period of {period:.6g} s right?"
+    for name, (time, _) in trial.signals.items():
+        if time[-1] < 0.0 or time[0] > end:
+            raise HannesError(
+                f"{where}: '{name}' was recorded from {time[0]:.6g} to {time[-1]:.6g} s, the reference from 0 to "
+                f"{end:.6g} s; they do not overlap: {hint}"
+            )
+        if time[-1] - time[0] > OTHER_LENGTH * end:
+            raise HannesError(
+                f"{where}: '{name}' lasts {time[-1] - time[0]:.6g} s and the reference {end:.6g} s: {hint}"
+            )
+    longest = max(float(time[-1]) for time, _ in trial.signals.values())
+    if end > OTHER_LENGTH * longest:
+        raise HannesError(
+            f"{where}: the reference lasts {end:.6g} s and all signals end at {longest:.6g} s: {hint}"
+        )
+    for number, closure in enumerate(trial.closures):
+        if closure.start < -EARLY or closure.stop > end + 1.5 * period:
+            raise HannesError(
+                f"{where}: closure {number + 1} ('{closure.condition}') runs from {closure.start:.6g} to "
+                f"{closure.stop:.6g} s, but the reference from 0 to {end:.6g} s: {hint}"
+            )
+    shortest = min(closure.stop - closure.start for closure in trial.closures)
+    for name, (time, _) in trial.signals.items():
+        step = float(np.median(np.diff(time)))
+        if step > shortest:
+            raise HannesError(
+                f"{where}: '{name}' has a sample every {step:.3g} s, but a closure lasts {shortest:.3g} s only: {hint}"
+            )
+
+
+def _covers(time: Array, closure: Closure) -> bool:
+    step = float(np.median(np.diff(time)))
+    return bool(time[0] - step <= closure.start + step and closure.stop - step <= time[-1] + step)
+
+
+def _noticed(trial: Trial, where: str) -> Trial:
+    """The trial without closures in which samples are missing; what else is strange of its times is said."""
+    times = {name: time for name, (time, _) in trial.signals.items()}
+    whole = tuple(
+        c
+        for c in trial.closures
+        if not any(_covers(time, c) and has_gap(time, c.start, c.stop) for time in times.values())
+    )
+    notes = [left_out(len(trial.closures) - len(whole))] if len(whole) < len(trial.closures) else []
+    end, longest = (trial.reference.size - 1) * trial.period, max(float(t[-1]) for t in times.values())
+    if not 1.0 / LENGTH <= end / longest <= LENGTH:
+        notes.append(
+            f"the reference lasts {end:.4g} s, and the signals end at {longest:.4g} s: is its period of "
+            f"{trial.period:.6g} s right?"
+        )
+    for name, time in times.items():
+        count = sum(_covers(time, c) for c in whole)
+        if not count and not any(_covers(time, c) for c in trial.closures):
+            raise HannesError(
+                f"{where}: '{name}' was recorded from {time[0]:.6g} to {time[-1]:.6g} s and covers no whole closure."
+            )
+        if not count:
+            raise NoClosure(f"{where}: samples are missing in each of its closures{_widest_gap(times)}.")
+        if count < len(whole):
+            notes.append(f"{name} covers {count} of {len(whole)} closures")
+    told = tuple(note for note in notes if note not in trial.notes)
+    return replace(trial, closures=whole, notes=(*trial.notes, *told))
+
+
+def _widest_gap(times: Mapping[str, Array]) -> str:
+    name, k, seconds = max(
+        ((n, int(np.argmax(np.diff(t))), float(np.diff(t).max())) for n, t in times.items()),
+        key=lambda gap: gap[2],
+    )
+    return f"; '{name}' has none for {seconds:.3g} s after {times[name][k]:.6g} s"
+
+
+def other_units(rig: Rig, model: Model, features: Features) -> list[str]:
+    """What is recorded in another unit or sign than the model's, as far as sizes tell.
+
+    The encoder against its reference, where the simulated one follows it; every other signal against its simulation,
+    from which a guess of the parameters may be far off.
+    """
+    out: dict[str, str] = {}
+    for trial, end in zip(features.trials, features.ends, strict=True):
+        try:
+            simulated = rig.simulate(model, {}, trial, trial.reference[:end])
+        except PlantDiverged:
+            continue
+        for name, (time, values) in trial.signals.items():
+            if name not in simulated or name in out:
+                continue
+            grid: Array = np.arange(simulated[name].size, dtype=np.float64) * trial.period
+            reference = (grid, trial.reference[: grid.size])
+            inside = time <= grid[-1]
+            ours, theirs = (grid, simulated[name]), (time[inside], values[inside])
+            said = _unlike(name, trial.unit(name), reference, ours, theirs)
+            if said:
+                out[name] = said
+    return list(out.values())
+
+
+def _unlike(name: str, unit: str, reference: Samples, simulated: Samples, measured: Samples) -> str | None:
+    there, here = (float(np.ptp(values)) if values.size else 0.0 for _, values in (measured, simulated))
+    if name != ENCODER:
+        if here > 0.0 and there > 0.0 and not 1.0 / FAR_OFF < there / here < FAR_OFF:
+            return f"{name} goes over {there:.3g} {unit}, simulated over {here:.3g}: is it recorded in another unit?"
+        return None
+    ours, theirs = follows(reference, simulated), follows(reference, measured)
+    # In closed loop the simulated position follows whatever the parameters are; open loop has another reference.
+    if ours is None or theirs is None or ours[1] < -AGAINST or not FOLLOWS[0] < ours[0] < 1.0 / FOLLOWS[0]:
+        return None
+    if theirs[1] < AGAINST:
+        return f"{name} moves against its reference, which the simulated one follows: has it the other sign?"
+    if not FOLLOWS[0] < theirs[0] < 1.0 / FOLLOWS[0]:
+        return (
+            f"{name} goes over {there:.3g} {unit}, {theirs[0]:.3g} times its reference, which the simulated one "
+            "follows: is it in another unit, or at another shaft?"
+        )
+    return None
+
+
+def _check_parts(trial: Trial, where: str) -> None:
+    """Parts that begin anew must be what a simulation of the first can stand for."""
+    wrong = next((part for part in trial.parts if not isinstance(part, Part)), None)
+    if wrong is not None:
+        raise HannesError(f"{where}: its parts must be hannes_lab.trials.Part, not {_kind(wrong)}.")
+    if stands_for_all(trial):
+        return
+    many = (
+        f"there are {len(trial.conditions)} conditions in it" if len(trial.conditions) > 1 else "they are not"
+    )
+    raise HannesError(
+        f"{where}: it is `fresh`, so each of its {len(trial.parts)} parts must repeat the first, its reference equal "
+        f"tick by tick; {many}. Give the recordings as trials of their own: those that repeat one condition are joined."
+    )

@@ -1,0 +1,346 @@
+"""What a broken adapter is told: one error of one line that says what is wrong and where, and no wrong numbers."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hannes_description.model import Model
+from hannes_lab.rig import load_rig
+from hannes_sim.factory import make_plant
+from hannes_sim.plant import DEFAULT_DT
+from hannes_sim.rollout import rollout, step_of
+from lab.foreign_bags import hannes
+from lab.single_mass_rig import reference, write_files
+
+BASE = f"{Path(__file__).parent / 'single_mass_rig.py'}:SingleMass"
+
+ADAPTER = """
+from dataclasses import replace
+import numpy as np
+from hannes_lab.rig import load_rig
+from hannes_lab.trials import Closure, Part, Trial
+
+Base = load_rig({base!r})
+
+
+def signal(t, name, change):
+    return replace(t, signals={{**t.signals, name: change(*t.signals[name])}})
+
+
+def position(t, change):
+    return signal(t, "encoder_position", change)
+
+
+def closures(t, change):
+    return replace(t, closures=tuple(change(c) for c in t.closures))
+
+
+class Mine(Base):
+    model = {model!r}
+
+    def logged(self, run, trial):
+        s = super().logged(run, trial)
+        return {logged}
+
+    @classmethod
+    def read(cls, paths):
+        return {read}
+
+    {more}
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three laps of the nominal mass, as its own simulation gives them, with the files of its model."""
+    folder = tmp_path_factory.mktemp("rig")
+    write_files(folder)
+    model, machine = Model.load(folder / "mass.yaml"), load_rig(BASE)([])
+    run = rollout(make_plant(model), machine.controller(model, 1e-3), reference(3))
+    rng = np.random.default_rng(3)
+    position = run.encoder_position + 2e-7 * rng.standard_normal(run.time.size)
+    force = run.motor_voltage + 0.02 * rng.standard_normal(run.time.size)
+    np.savez(folder / "mass.npz", reference=run.reference_position, position=position, force=force)
+    return folder
+
+
+class Lab:
+    """`hannes compare` with an adapter of which one thing is changed."""
+
+    def __init__(
+        self, folder: Path, here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ):
+        self.folder, self.here, self._capsys, self._monkeypatch = folder, here, capsys, monkeypatch
+        self.model = folder / "mass.yaml"
+
+    def __call__(
+        self, change: str = "t", *words: str, read: str = "", logged: str = "s", more: str = ""
+    ) -> tuple[int, str, str]:
+        read = read or f"[{change} for t in Base.read(paths)]"
+        file = self.here / f"mine{len(list(self.here.glob('mine*.py')))}.py"  # a file is executed once
+        file.write_text(ADAPTER.format(base=BASE, model=str(self.model), read=read, logged=logged, more=more))
+        given = ["compare", str(self.folder / "mass.npz"), "--rig", f"{file}:Mine", *words]
+        code, out, err = hannes(*given, capsys=self._capsys, monkeypatch=self._monkeypatch)
+        return code, " ".join(out.split()), err
+
+    def refused(self, *change: str, **how: str) -> str:
+        code, _, err = self(*change, **how)
+        assert code == 2, err
+        assert len(err.strip().splitlines()) == 1, err
+        return err
+
+
+@pytest.fixture
+def lab(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Lab:
+    return Lab(folder, tmp_path, capsys, monkeypatch)
+
+
+def test_a_good_adapter_is_not_complained_of(lab: Lab) -> None:
+    code, out, err = lab()
+    assert code == 0 and not err and "Overall error" in out
+
+
+@pytest.mark.parametrize(
+    ("read", "said"),
+    [
+        ("None", "Mine.read returned nothing"),
+        ("[]", "Mine.read returned no trial"),
+        ("Base.read(paths)[0]", "must return a list of trials"),
+        ("[np.zeros(3)]", "must be a hannes_lab.trials.Trial"),
+        ("{}['x']", "Mine.read failed: KeyError: 'x' .*mine0.py, line"),
+    ],
+)
+def test_what_read_returns_must_be_trials(lab: Lab, read: str, said: str) -> None:
+
+    assert re.search(said, lab.refused(read=read))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("replace(t, period=0.0)", "its period is 0.0"),
+        ("replace(t, period=1e-4)", "lasts 7.799 s and the reference 0.7799 s"),
+        ("replace(t, period=1e-2)", "the reference lasts 77.99 s and all signals end at 7.799 s"),
+        ("replace(t, reference=t.reference[:, None])", "the reference has the shape (7800, 1)"),
+        ("replace(t, reference=t.reference + np.where(t.reference > 0.05, np.nan, 0))", "the reference has"),
+        ("replace(t, signals={})", "it has no signals"),
+        ("position(t, lambda x, y: (x, y[:-3]))", "'encoder_position' has 7800 time stamps and 7797 values"),
+        ("position(t, lambda x, y: (x, np.where(x > 5, np.nan, y)))", "'encoder_position' has 2799 of 7800 values"),
+        ("position(t, lambda x, y: y)", "must be a pair (time, values)"),
+        ("position(t, lambda x, y: (x[::-1], y))", "time stamps of 'encoder_position' go back"),
+        ("position(t, lambda x, y: (1e3 * x, y))", "are time stamps in seconds"),
+        ("position(t, lambda x, y: (x + 1e3, y))", "they do not overlap"),
+        ("position(t, lambda x, y: (x[:300], y[:300]))", "covers no whole closure"),
+        ("closures(t, lambda c: replace(c, start=c.stop, stop=c.start))", "it must stop later than it starts"),
+        ("closures(t, lambda c: replace(c, stop=c.stop + 5))", "but the reference from 0 to 7.799 s"),
+        ("closures(t, lambda c: replace(c, start=c.start - 5))", "but the reference from 0 to 7.799 s"),
+        ("closures(t, lambda c: (c.start, c.stop))", "closure 1 is a tuple"),
+        ("replace(t, reference=t.reference[:5000])", "but the reference from 0 to 4.999 s"),
+        ("position(t, lambda x, y: (x[::800], y[::800]))", "has a sample every 0.8 s, but a closure lasts"),
+    ],
+)  # fmt: skip
+def test_a_recording_that_cannot_be_replayed_is_refused(lab: Lab, change: str, said: str) -> None:
+    told = lab.refused(change)
+    assert said in told and "trial 'mass'" in told.replace("Trial", "trial")
+
+
+def test_numbers_may_come_as_lists(lab: Lab) -> None:
+    code, out, _ = lab("position(t, lambda x, y: (list(x), list(y)))")
+    assert code == 0 and out == lab()[1]
+
+
+@pytest.mark.parametrize(
+    ("logged", "said"),
+    [
+        ("None", "it returned nothing"),
+        ("{'position': run.encoder_position}", "gives no encoder_position, drive_force"),
+        ("{k: v[:-5] for k, v in s.items()}", "of shape (7795,)"),
+        ("{k: list(v) for k, v in s.items()}", "as list"),
+        ("{**s, 'drive_force': s['drive_force'] * np.nan}", "makes 'drive_force' of trial 'mass' NaN"),
+        ("{**s, 'drive_force': trial.options['gain']}", "failed: KeyError: 'gain'"),
+    ],
+)
+def test_logged_must_give_what_was_recorded(lab: Lab, logged: str, said: str) -> None:
+    told = lab.refused(logged=logged)
+    assert "Mine.logged" in told and said in told
+
+
+def test_a_signal_that_logged_does_not_give_may_be_left_out_of_the_comparison(lab: Lab) -> None:
+    more = "replace(t, signals={**t.signals, 'speed': t.signals['drive_force']})"
+    assert "it gives no speed, which was recorded" in lab.refused(more)
+    code, _, _ = lab(more, "--signal", "encoder_position")
+    assert code == 0
+
+
+def test_closures_with_a_gap_are_left_out(lab: Lab) -> None:
+    gap = "position(t, lambda x, y: (np.delete(x, slice(500, 700)), np.delete(y, slice(500, 700))))"
+    code, out, _ = lab(gap)
+    assert code == 0 and "1 closure in which samples are missing is left out" in out
+    gaps = "position(t, lambda x, y: (x[x % 0.3 < 0.2], y[x % 0.3 < 0.2]))"
+    assert (
+        "samples are missing in each of its closures; 'encoder_position' has none for 0.101 s"
+        in lab.refused(gaps)
+    )
+    some = "position(t, lambda x, y: (x[:4000], y[:4000]))"
+    assert "encoder_position covers 7 of 15 closures" in lab(some)[1]
+
+
+FRESH = (
+    "replace(t, closures=tuple(replace(c, condition='lap') for c in t.closures if c.condition == t.conditions[0]), "
+    "parts=tuple(Part(str(k), '', '', 2.6 * k) for k in range(3)), fresh=True"
+)
+
+
+def test_parts_that_begin_anew_must_be_equal_tick_by_tick(lab: Lab) -> None:
+    assert lab(f"{FRESH})")[0] == 0
+    other = f"{FRESH}, reference=t.reference * (1 + 0.1 * (np.arange(t.reference.size) > 2000)))"
+    assert "its reference equal tick by tick" in lab.refused(other)
+    many = "replace(t, parts=tuple(Part(str(k), '', '', 2.6 * k) for k in range(3)), fresh=True)"
+    assert "conditions in it" in lab.refused(many)
+
+
+def with_model(lab: Lab, model: str = "", **parameters: str) -> None:
+    """Another model file beside the adapter, with lines of its parameters replaced."""
+    text = (lab.folder / "parameters.yaml").read_text()
+    for before, after in parameters.items():
+        assert before in text
+        text = "\n".join(
+            after if line.strip().startswith(f"{before}:") else line for line in text.splitlines()
+        )
+    (lab.here / "parameters.yaml").write_text(text)
+    lab.model = lab.here / "mass.yaml"
+    lab.model.write_text(model or (lab.folder / "mass.yaml").read_text())
+
+
+LAW = """
+import numpy as np
+from hannes_sim.native import CONTROL_SIGNATURE
+from numba import cfunc
+
+
+def control(x, p, s):
+    {body}
+    return 0.0
+
+
+COMPILED = cfunc(CONTROL_SIGNATURE)(control)
+
+
+class Law:
+    def __init__(self, parameters, period):
+        self.address, self.period = {address}, {period}
+        self.parameters, self.states = {parameters}, np.zeros(1)
+
+    def reset(self):
+        pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"body": "s.foo = 1"}, "TypingError: Cannot resolve setattr: (float64*).foo"),
+        ({"address": "0"}, "its address is 0"),
+        ({"address": "None"}, "its address is None"),
+        ({"parameters": "[1.0]"}, "its `parameters` must be a numpy array of floats"),
+        ({"parameters": "np.zeros(2, dtype=int)"}, "its `parameters` must be a numpy array of floats"),
+        ({"period": "0.002"}, "its period is 0.002 s, that of the trial 0.001 s"),
+        ({"parameters": "parameters['gain']"}, "Unknown parameter 'gain'"),
+        ({"parameters": "parameters.gain"}, "AttributeError"),
+    ],
+)
+def test_a_control_law_that_cannot_run_is_refused(lab: Lab, change: dict[str, str], said: str) -> None:
+    """Address 0 would end the process without a word."""
+    given = {"body": "pass", "address": "COMPILED.address", "period": "period", "parameters": "np.zeros(1)"}
+    (lab.here / "law.py").write_text(LAW.format(**{**given, **change}))
+    with_model(lab, (lab.folder / "mass.yaml").read_text().replace(BASE.rpartition(":")[0], "law.py"))
+    assert said in lab.refused()
+
+
+def test_a_model_that_lacks_what_its_plant_needs_is_refused(lab: Lab) -> None:
+    with_model(lab, supply="", armature="")
+    assert (
+        "missing parameters: supply.voltage, motor.armature (the reduced plant cannot do without)"
+        in lab.refused()
+    )
+    with_model(lab, "schema: hannes/model/1\nplant: reduced\nparameters: parameters.yaml\n", supply="")
+    told = lab.refused()
+    assert (
+        "supply.voltage (the reduced plant" in told
+        and "control.kp" in told
+        and "the control law double_pid" in told
+    )
+
+
+def test_a_law_that_the_adapter_makes_is_checked_too(lab: Lab) -> None:
+    told = lab.refused(more="def controller(self, model, period): return model.gain")
+    assert "Mine.controller failed: AttributeError" in told
+    assert "its address is None" in lab.refused(more="def controller(self, model, period): return 3")
+
+
+def test_any_control_period_is_simulated(lab: Lab) -> None:
+    """300 Hz is no multiple of the plant's usual step, 0.1 ms is less than it: the step follows."""
+    for period in (1 / 300, 1e-4):
+        at = f"np.arange(round(t.reference.size * 1e-3 / {period})) * {period}"
+        resampled = f"np.interp({at}, np.arange(t.reference.size) * 1e-3, t.reference)"
+        resampled = f"replace(t, period={period}, reference={resampled})"
+        code, out, err = lab(resampled, "--json")
+        assert code == 0, err
+        errors = json.loads(out)["errors"]
+        assert max(e["rmse"] for e in errors if e["unit"] == "m") < 2e-4, (
+            "the recording's own model, at another rate"
+        )
+    usual = [1e-3, 2e-3, 0.25e-3, 0.01]
+    assert [step_of(period) for period in usual] == [DEFAULT_DT] * 4
+    assert step_of(1 / 300) == pytest.approx(1 / 300 / 14) and step_of(1e-4) == 1e-4
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            "position(t, lambda x, y: (x, 57.3 * y))",
+            "times its reference, which the simulated one follows",
+        ),
+        ("position(t, lambda x, y: (x, -y))", "encoder_position moves against its reference"),
+        ("signal(t, 'drive_force', lambda x, y: (x, 1e3 * y))", "is it recorded in another unit?"),
+        ("replace(t, reference=np.append(t.reference, np.zeros(2000)))", "is its period of 0.001 s right?"),
+    ],
+)
+def test_what_looks_like_another_unit_or_sign_is_said(lab: Lab, change: str, said: str) -> None:
+    code, out, _ = lab(change)
+    assert code == 0 and said in out
+
+
+def test_what_is_said_to_another_machine_is_not_said_of_a_hand(lab: Lab) -> None:
+    one = "replace(t, closures=tuple(c for c in t.closures if c.condition == t.conditions[0]))"
+    code, out, _ = lab(one)
+    assert code == 0 and "record another speed, and another load" in out and "forward" in out
+    assert not re.search(r"\b(hand|grasp|void|opening)\b", out)
+    single = "replace(t, closures=t.closures[:1])"
+    assert "not known in repeatabilities" in lab(single)[1]
+    alone = "replace(t, signals={'encoder_position': t.signals['encoder_position']})"
+    assert "no drive force is recorded" in lab(alone)[1]
+
+
+def test_parameters_of_the_hand_are_not_taken_in_silence(lab: Lab) -> None:
+    with_model(
+        lab,
+        f"schema: hannes/model/1\nname: bare\nplant: reduced\ncontroller: '{BASE.rpartition(':')[0]}:Law'\n",
+    )
+    code, out, _ = lab()
+    assert code == 0 and "the parameters of model 'bare' are the Hannes hand's" in out
+    with_model(lab)
+    assert "Hannes hand's" not in lab()[1]
+
+
+def test_repeats_that_a_coarse_sensor_shows_alike_are_known_to_the_rigs_floor(lab: Lab) -> None:
+    """Rounded to 0.1 mm the machine repeats itself here and there, but for the last bit."""
+    _, out, _ = lab("position(t, lambda x, y: (x, np.round(y, 4)))", "--json")
+    cells = [c for c in json.loads(out)["cells"] if c["signal"] == "encoder_position"]
+    least = [1e-5 * abs(float(b) - float(a)) * 1e-3 for c in cells for a, _, b, _ in [c["condition"].split()]]
+    assert all(c["repeatability"] > 0.9 * floor for c, floor in zip(cells, least, strict=True))

@@ -1,0 +1,132 @@
+"""Recordings of a rig in several files: those that repeat one condition are taken together, as bags are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hannes_description.model import Model
+from hannes_lab.compare import compare
+from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.rig import load_rig
+from hannes_lab.trials import Closure, Trial
+from hannes_sim.factory import make_plant
+from hannes_sim.rollout import VoltagePlayback, rollout
+from lab.single_mass_rig import write_files
+from lab.test_rig_checks import BASE
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> type:
+    folder = tmp_path_factory.mktemp("rig")
+    write_files(folder)
+    found = load_rig(BASE)
+
+    class Mass(found):
+        model, population, source = folder / "mass.yaml", folder / "tolerances.yaml", ""
+
+    return Mass
+
+
+def moves(rig: type, kind: str, there: float, back: float, count: int, fresh: bool = False) -> list[Trial]:
+    """Files of one move each, from rest at zero to `there` and on to `back` [m], with noise."""
+    u = np.linspace(0.0, 1.0, 500)
+    soft = u - np.sin(2 * np.pi * u) / (2 * np.pi)
+    reference = np.concatenate(
+        [np.zeros(50), there * soft, there + (back - there) * soft, np.full(400, back)]
+    )
+    machine = rig([])
+    model = Model.load(rig.model)
+    run = rollout(make_plant(model), machine.controller(model, 1e-3), reference)
+    rng = np.random.default_rng(count)
+    time = np.arange(reference.size) * 1e-3
+    out = []
+    for k in range(count):
+        signals = {
+            "encoder_position": (time, run.encoder_position + 2e-7 * rng.standard_normal(time.size)),
+            "drive_force": (time, run.motor_voltage + 0.02 * rng.standard_normal(time.size)),
+        }
+        units = {"drive_force": "N", "encoder_position": "m"}
+        closure = Closure(0.0, float(time[-1]), kind)
+        out.append(Trial(f"{kind}{k}", 1e-3, reference, signals, (closure,), units=units, fresh=fresh))
+    return out
+
+
+def prepared(rig: type, *trials: Trial) -> Prepared:
+    return prepare(trials, Model.load(rig.model), rig=rig)
+
+
+def test_files_that_repeat_a_condition_are_taken_together(rig: type) -> None:
+    found = prepared(rig, *moves(rig, "far", 0.1, 0.0, 6), *moves(rig, "near", 0.02, 0.0, 3))
+    far, near = found.features.trials
+    assert (len(far.closures), far.conditions) == (6, ("far",))
+    assert (len(near.closures), near.conditions) == (3, ("near",))
+    assert not far.anew and any("6 recordings repeat one condition" in note for note in found.notes)
+    assert not any("fewer than five closures of far" in note for note in found.notes)
+    assert all(b.n == (6 if b.condition == "far" else 3) for b in found.features.blocks)
+
+
+def test_an_adapter_says_that_each_file_begins_as_the_first(rig: type) -> None:
+    """Each ends elsewhere than it began: a simulation that goes on from there would be another one."""
+    (trial,) = prepared(rig, *moves(rig, "step", 0.05, 0.04, 4, fresh=True)).features.trials
+    assert trial.anew and trial.repeats == (0, 0, 0, 0)
+    # It need not be said where it is seen: all end that far from where they began.
+    (seen,) = prepared(rig, *moves(rig, "step", 0.05, 0.04, 4)).features.trials
+    assert seen.anew and seen.repeats == trial.repeats
+
+
+def test_what_cannot_be_told_stays_apart_and_is_told_apart(rig: type) -> None:
+    """Without an encoder nobody sees how a recording began."""
+    blind = [
+        replace(t, signals={"drive_force": t.signals["drive_force"]}) for t in moves(rig, "x", 0.05, 0.0, 2)
+    ]
+    found = prepared(rig, *blind)
+    assert len(found.features.trials) == 2
+    assert any("x0, x1 are of one condition, 'x', and are not taken together" in note for note in found.notes)
+    result = compare(found)
+    assert {cell.condition for cell in result.cells} == {"x (x0)", "x (x1)"}
+    assert [e.condition for e in result.errors] == ["x (x0)", "x (x1)"]
+    assert {o.condition for o in result.overlays} == {"x (x0)", "x (x1)"}
+    (said,) = prepared(rig, *(replace(t, fresh=True) for t in blind)).features.trials
+    assert len(said.closures) == 2
+
+
+def test_trials_with_many_closures_or_conditions_stay_alone(rig: type) -> None:
+    one, two = moves(rig, "a", 0.05, 0.0, 2)
+    several = [
+        replace(t, closures=(Closure(0.0, 0.5, "out"), Closure(0.55, 1.1, "back"))) for t in (one, two)
+    ]
+    assert len(prepared(rig, *several).features.trials) == 2
+    other = replace(two, options={"gain": np.ones(3)})
+    assert len(prepared(rig, one, other).features.trials) == 2
+    same = replace(one, options={"gain": np.ones(3)})
+    assert len(prepared(rig, same, other).features.trials) == 1
+
+
+def test_a_name_that_two_recordings_have_is_made_their_own(rig: type) -> None:
+    one, two = moves(rig, "a", 0.05, 0.0, 1) + moves(rig, "b", 0.02, 0.0, 1)
+    trials = prepared(rig, replace(one, name="x"), replace(two, name="x")).features.trials
+    assert [t.name for t in trials] == ["x", "x#2"]
+
+
+def test_a_recording_alone_begins_but_once(rig: type) -> None:
+    """`fresh` of a recording with several closures that nothing is joined to says nothing."""
+    (one,) = moves(rig, "a", 0.05, 0.0, 1, fresh=True)
+    two = replace(one, closures=(Closure(0.0, 1.0, "a"), Closure(1.0, 1.2, "a")))
+    (trial,) = prepared(rig, two).features.trials
+    assert trial.repeats == (0, 1) and not trial.anew
+
+
+def test_a_recorded_command_is_replayed_without_a_controller(rig: type) -> None:
+    """Open loop: the reference is the command, and the adapter's control law hands it on."""
+    (one,) = moves(rig, "open", 0.05, 0.0, 1)
+
+    class Open(rig):
+        def controller(self, model, period):
+            return VoltagePlayback(period)
+
+    command = replace(one, reference=one.signals["drive_force"][1])
+    model = replace(Model.load(rig.model), controller="double_pid")  # as a model file that names none
+    found = prepare([command], model, rig=Open)
+    errors = {e.signal: e.rmse for e in compare(found).errors}
+    assert errors["drive_force"] < 1e-9 and errors["encoder_position"] < 1e-3
+    assert not any("reference, which the simulated one" in note for note in found.notes)
