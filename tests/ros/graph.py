@@ -27,6 +27,9 @@ PROGRAMS = {
     "composed": "hannes_bringup.composed_node",
 }
 
+PATIENT = {"command_timeout_ms": 10_000.0}
+"""A hand_sim that repeats no reading to a peer that is no newcomer but may be slow."""
+
 
 class NodeProcess:
     """One node as a process of its own, its output kept."""

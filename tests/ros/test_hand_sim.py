@@ -7,12 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from graph import NodeProcess, kept_waiting, processes
+from graph import PATIENT, NodeProcess, kept_waiting, processes
 from hannes_description.joints import JOINT_NAMES
 from hannes_ros import convert
-
-PATIENT = {"command_timeout_ms": 10_000.0}
-"""A hand_sim that repeats no reading to this peer, which is no newcomer but may be slow."""
 
 
 def say_voltage(peer, value: float) -> None:

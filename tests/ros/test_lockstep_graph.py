@@ -7,7 +7,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from graph import NodeProcess, Peer, processes
+from graph import PATIENT, NodeProcess, Peer, processes
 from hannes_control.double_pid import DoublePID
 from hannes_control.emg import SyntheticEmg, emg_reference, synthesise
 from hannes_control.reference import half_sine
@@ -21,8 +21,6 @@ from rclpy.context import Context
 SECONDS = 0.8
 TICKS = 800
 SIGNALS = ("encoder_position", "motor_current", "motor_voltage", "reference_position")
-PATIENT = {"command_timeout_ms": 10_000.0}
-"""A hand_sim that repeats no reading to those who are only slow."""
 
 
 def in_process(reference: np.ndarray, grasp: str, plant: str = "reduced") -> Rollout:
