@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import socket
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hannes_bringup.environment import apply_ros_environment
 
 # As the hannes command does, and before numpy is imported: sums in one order, the same numbers in every process.
 for _library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -16,17 +16,9 @@ for _library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
-DISCOVERY_PROFILE = REPOSITORY / "ros2_ws/src/hannes_bringup/hannes_bringup/config/fastdds.xml"
-
-# Read by ROS 2 when the first node of the process starts, so set before any test: this host only; UDP, since
-# the shared memory of a killed process holds up the next discovery for seconds; early announcements.
-os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
-os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(DISCOVERY_PROFILE))
+# Read by ROS 2 when the first node of the process starts, so set before any test
+apply_ros_environment()
 os.environ.setdefault("RCUTILS_COLORIZED_OUTPUT", "0")
-if not os.environ.get("AMENT_PREFIX_PATH"):
-    # the wheels put ROS 2 into the environment itself, which so is a prefix of the ament index
-    os.environ["AMENT_PREFIX_PATH"] = sys.prefix
 
 FIRST_DOMAIN, LAST_DOMAIN = 1, 101
 # A process that uses domain d holds this TCP port plus d, below the ports that the kernel hands out

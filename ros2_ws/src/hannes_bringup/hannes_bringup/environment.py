@@ -17,7 +17,9 @@ def ros_environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
 
     AMENT_PREFIX_PATH              this Python environment, where ROS 2 came as wheels and nothing is sourced
     ROS_AUTOMATIC_DISCOVERY_RANGE  LOCALHOST: nodes on other machines neither see nor drive the hand
-    FASTDDS_BUILTIN_TRANSPORTS     UDPv4: after a kill -9 the shared memory left behind stalls discovery for seconds
+    FASTDDS_BUILTIN_TRANSPORTS     UDPv4: after a kill -9 the shared memory left behind stalls discovery for seconds.
+                                   Fast DDS' own choice holds for another range than LOCALHOST only, for which ROS
+                                   always takes shared memory and UDP
     FASTRTPS_DEFAULT_PROFILES_FILE config/fastdds.xml: nodes find each other at once on a busy machine, too
     ROS_LOG_DIR                    a temporary folder, where the home folder cannot be written
 
