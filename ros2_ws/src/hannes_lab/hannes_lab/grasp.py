@@ -31,6 +31,9 @@ EXCESS_OVER_NOMINAL = 2.0
 """An object is seen where the current exceeds this multiple of what moves the free hand at the same place, by this much
 (A).  The nominal hand's current is less to be trusted than that of another recording of the same hand."""
 
+STANDS = 1e-3
+"""Part of the way that counts as one place."""
+
 STIFFER = 3.0
 """An object is stiffer than this multiple of the hand's own springs."""
 
@@ -121,7 +124,17 @@ def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:
     if rising.size < 8:
         return None
     q = np.maximum.accumulate(position[rising[0] : top + 1])
-    return q, current[rising[0] : top + 1]
+    return _advancing(q, current[rising[0] : top + 1])
+
+
+def _advancing(position: Array, current: Array) -> tuple[Array, Array]:
+    """A curve of places (p,) that do not go back, each with its largest current: what made the hand go on from there.
+
+    Where friction holds it, the current may be anything below that: a user who relaxes and pulls again moves nothing.
+    """
+    step = max(STANDS * float(position[-1] - position[0]), 1e-12)
+    first = np.unique((position - position[0]) // step, return_index=True)[1]
+    return position[first], np.maximum.reduceat(current, first)
 
 
 def _nominal(model: Model) -> tuple[float, float, float]:
