@@ -86,17 +86,19 @@ HIDDEN: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...]], ...] =
     (("a worn spot",), "30 Hz rectified", (("spot", 0.03), ("spot_at", 5.0))),
     (("quadratic drag",), "100 Hz", (("drag", 1.5e-4),)),
     (("quadratic drag",), "50 Hz", (("drag", 4e-4),)),
+    (("gearbox_inertia",), "50 Hz", (("rotor", 1.6),)),
+    (("gearbox_inertia",), "100 Hz", (("rotor", 2.2),)),
 )
-"""What is hidden, as the catalogue calls it if it does, the log, and values of Hand (`viscous` as a factor)."""
+"""What is hidden, as the catalogue calls it if it does, the log, and values of Hand (`viscous` and `rotor` as factors)."""
 
 OUTSIDE = ("a worn spot", "quadratic drag", "hysteresis", "a shaking mount")
-RELATIVE = ("viscous",)
+RELATIVE = ("viscous", "rotor")
 
 CLEAN: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = (
     ("30 Hz rectified", ()), ("50 Hz", ()), ("100 Hz", ()), ("30 Hz rectified", (("wire", 1.5),)),
     ("50 Hz", (("kp", 0.55), ("kd", 0.03), ("current_kp", 0.05), ("current_ki", 600.0))),
     ("100 Hz", (("friction", 0.020), ("load_friction", 0.012))), ("30 Hz rectified", (("blur", 0.1),)),
-    ("100 Hz", (("load", 8e-6), ("wire_damping", 2e-3))),
+    ("100 Hz", (("load", 8e-6), ("wire_damping", 2e-3))), ("50 Hz", (("rotor", 1.12),)),
 )  # fmt: skip
 """Nothing is hidden, but the hand, its controller or the simulator's friction law is another."""
 

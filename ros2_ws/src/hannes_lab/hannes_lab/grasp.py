@@ -168,10 +168,19 @@ def _seen(
         return None
     excess = (current - base)[: peak + 1]
     # From the peak backwards: what a quick start takes more than a slow one is no object.
-    first, last = (int(np.max(np.flatnonzero(excess < part * excess[-1]), initial=0)) for part in RISE)
-    run = max(float(q[last] - q[first]), 1e-3)
-    slope = max(float(excess[last] - excess[first]), 1e-6) / run
-    place = float(q[first]) - float(excess[first]) / slope
+    (start, low), (stop, high) = (_last_rise(q, excess, part * float(excess[-1])) for part in RISE)
+    slope = max(high - low, 1e-6) / max(stop - start, 1e-3)
+    place = start - low / slope
     if slope * per_ampere < STIFFER * rate or place < FREE_TRAVEL * q[-1]:
         return None
     return float(np.clip(slope * per_ampere, 1e-3, 5.0)), max(place, 0.0)
+
+
+def _last_rise(q: Array, excess: Array, level: float) -> tuple[float, float]:
+    """Where a curve last rises through a level, and its value there; its beginning if it is above from the start."""
+    below = np.flatnonzero(excess < level)
+    if not below.size:
+        return float(q[0]), float(excess[0])
+    k = int(below[-1])
+    part = (level - excess[k]) / (excess[k + 1] - excess[k])
+    return float(q[k] + part * (q[k + 1] - q[k])), level

@@ -65,6 +65,10 @@ _WIRE = "wire.stiffness"
 _UNKNOWN_WIRE_SD = 0.5
 """Width of its prior (of the logarithm): nobody measured it, and on an unknown object it counts with the object's."""
 
+_ROTOR = "motor.armature"
+_UNKNOWN_ROTOR_SD = 0.05
+"""Width of its prior (of the logarithm): data sheets give a rotor's inertia to a tenth, and what turns with it not."""
+
 _APART = 4.0
 """Standard deviations from the mean over the recordings: one hand whose open position, or clock, is elsewhere in each
 recording is no explanation, however well it fits."""
@@ -237,9 +241,11 @@ class HandRig(PlantRig):
             ]
         other = [trial for trial in self.trials if not is_of(trial, model)]
         known = self._plant(model.without_effects(), other[0])[0].names if other else ()
-        if _WIRE in known and model.parameters.value(_WIRE) > 0.0:
-            unit = model.parameters[_WIRE].unit
-            out.append(Nuisance(_WIRE, model.parameters.value(_WIRE), _UNKNOWN_WIRE_SD, True, unit=unit))
+        out += [
+            Nuisance(name, model.parameters.value(name), sd, True, unit=model.parameters[name].unit)
+            for name, sd in ((_WIRE, _UNKNOWN_WIRE_SD), (_ROTOR, _UNKNOWN_ROTOR_SD))
+            if name in known and model.parameters.value(name) > 0.0
+        ]
         if strange:
             out.append(Nuisance(HOMING, 0.0, _UNKNOWN_HOMING_SD, False, unit="rad", lower=0.0))
         logged = [t.signals["motor_current"][0] for t in strange if "motor_current" in t.signals]
