@@ -89,7 +89,7 @@ HIDDEN: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...]], ...] =
     (("gearbox_inertia",), "50 Hz", (("rotor", 1.6),)),
     (("gearbox_inertia",), "100 Hz", (("rotor", 2.2),)),
 )
-"""What is hidden, as the catalogue calls it if it does, the log, and values of Hand (`viscous` and `rotor` as factors)."""
+"""What is hidden, as the catalogue calls it if it does, the log, and values of Hand (`viscous`, `rotor` as factors)."""
 
 OUTSIDE = ("a worn spot", "quadratic drag", "hysteresis", "a shaking mount")
 RELATIVE = ("viscous", "rotor")
