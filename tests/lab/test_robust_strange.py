@@ -20,7 +20,7 @@ from hannes_lab.hide import make_set
 from hannes_lab.prepare import load_trials, prepare
 from hannes_lab.problem import nuisance_coordinate
 from hannes_lab.search import Candidate, Search, wide_starts
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.trials import Closure, Trial, make_trial
 from hannes_sim.effect import load_effect, strength_of
 from lab.foreign_bags import Signals, signals_of_set, write_set
 
@@ -153,6 +153,70 @@ def test_a_quick_start_is_no_part_of_the_grasp() -> None:
     assert seen is not None
     stiffness, place = seen
     assert place == pytest.approx(7.2, abs=0.5) and stiffness == pytest.approx(0.21 * 0.32 / 4.5, rel=0.1)
+
+
+def closing(name: str, position: list[tuple[float, float]], current: list[tuple[float, float]]) -> Trial:
+    """A recording of one closure: position by time, current by time."""
+    time = np.arange(0.0, 4.0, 0.01)
+    signals = {
+        signal: (time, np.interp(time, *np.transpose(points)))
+        for signal, points in (("encoder_position", position), ("motor_current", current))
+    }
+    reference = np.interp(np.arange(0.0, 4.0, 0.001), *np.transpose(position))
+    return Trial(name, 0.001, reference, signals, (Closure(0.0, 4.0, name),))
+
+
+def seen_in(trial: Trial, free: Trial) -> dict[str, float]:
+    seen, nothing = with_seen_objects([trial, free], Model.load())
+    assert "object" not in nothing.options
+    return {**seen.options["object"]}
+
+
+def test_a_user_who_relaxes_and_pulls_again_grasps_at_one_place() -> None:
+    """While friction holds the hand, its current says nothing of the object."""
+    way = [(0.0, 0.0), (1.2, 11.0), (2.0, 11.0), (2.2, 11.2), (2.6, 11.2), (3.6, 0.0)]
+    pull = [
+        (0.0, 0.2),
+        (0.65, 0.2),
+        (1.2, 0.55),
+        (1.6, 0.3),
+        (2.0, 0.55),
+        (2.2, 0.6),
+        (2.6, 0.3),
+        (3.0, -0.1),
+    ]
+    none = [(0.0, 0.2), (1.2, 0.2), (1.6, 0.05), (2.0, 0.2), (2.2, 0.25), (2.6, 0.1), (3.0, -0.1)]
+    seen = seen_in(closing("ball", way, pull), closing("free", way, none))
+    value = Model.load().parameters.value
+    travel = value("hand.fingertip_travel")
+    assert (value("hand.opening") - seen["size"]) / travel == pytest.approx(6.0, abs=0.5)
+    ampere_per_rad = 0.35 / (11.0 * (1.2 - 0.65) / 1.2)
+    per_ampere = value("motor.kt") * value("gear.ratio") * value("gear.efficiency")
+    assert seen["stiffness"] * travel**2 == pytest.approx(ampere_per_rad * per_ampere, rel=0.15)
+
+
+def test_a_hand_that_hits_and_stands_has_grasped_something_hard() -> None:
+    """It springs back, and the current rises while the place stays the same."""
+    way = [(0.0, 0.0), (0.8, 8.8), (0.9, 8.4), (1.4, 8.79), (2.2, 8.8), (2.6, 8.81), (3.6, 0.0)]
+    pull = [(0.0, 0.3), (0.75, 0.1), (1.4, 1.2), (2.6, 1.4), (3.0, -0.1)]
+    free = [(0.0, 0.3), (0.75, 0.2), (2.6, 0.25), (3.0, -0.1)]
+    seen = seen_in(closing("bar", way, pull), closing("free", [(0.0, 0.0), (1.2, 12.0), (3.6, 0.0)], free))
+    value = Model.load().parameters.value
+    travel = value("hand.fingertip_travel")
+    assert (value("hand.opening") - seen["size"]) / travel == pytest.approx(8.8, abs=0.3)
+    assert seen["stiffness"] > 5e3
+
+
+def test_another_hands_rotor_is_fitted_and_is_no_torque_constant(tmp_path: Path) -> None:
+    """A data sheet gives the inertia to a tenth; held, a weaker motor would make up for a heavier rotor."""
+    model = Model.load().with_values({**STRANGE, "motor.armature": 1.25e-6})
+    conditions = signals_of_set(model=model, conditions=("slow", "fast"), closures=6, seed=12)
+    prepared = prepare(load_trials([write_set(tmp_path / "bags", conditions, late)]), Model.load())
+    fit = Search(prepared.problem, prepared.model, prepared.nuisances, {}).null().fit
+    assert fit.values["motor.armature"] == pytest.approx(1.25e-6, rel=0.06)
+    described, _ = make_set(Model.load(), [], seed=12, closures=2, conditions=("slow",))
+    known = prepare([make_trial(one) for one in described], Model.load())
+    assert "motor.armature" not in {n.name for n in known.nuisances}
 
 
 def test_the_model_as_it_is_is_fitted_from_several_starts_where_little_is_known(tmp_path: Path) -> None:
