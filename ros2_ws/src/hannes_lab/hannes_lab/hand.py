@@ -66,8 +66,8 @@ _UNKNOWN_WIRE_SD = 0.5
 """Width of its prior (of the logarithm): nobody measured it, and on an unknown object it counts with the object's."""
 
 _ROTOR = "motor.armature"
-_UNKNOWN_ROTOR_SD = 0.05
-"""Width of its prior (of the logarithm): data sheets give a rotor's inertia to a tenth, and what turns with it not."""
+_UNKNOWN_ROTOR_SD = 0.02
+"""Width of its prior (of the logarithm).  It is what tells a current sensor's gain from a hand of which all is heavier."""
 
 _APART = 4.0
 """Standard deviations from the mean over the recordings: one hand whose open position, or clock, is elsewhere in each
