@@ -67,7 +67,7 @@ _UNKNOWN_WIRE_SD = 0.5
 
 _ROTOR = "motor.armature"
 _UNKNOWN_ROTOR_SD = 0.02
-"""Width of its prior (of the logarithm).  It is what tells a current sensor's gain from a hand of which all is heavier."""
+"""Width of its prior (of the logarithm).  It tells a current sensor's gain error from a hand that is heavier in all."""
 
 _APART = 4.0
 """Standard deviations from the mean over the recordings: one hand whose open position, or clock, is elsewhere in each
