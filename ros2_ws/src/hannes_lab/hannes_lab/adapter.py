@@ -17,7 +17,7 @@ from hannes_description.model import Model
 from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
-from .features import Features, stands_for_all
+from .features import Features, kind_of, stands_for_all
 from .rig import Rig
 from .trials import EARLY, Closure, NoClosure, Part, Trial, has_gap, left_out, unique_names
 from .units import AGAINST, ENCODER, FOLLOWS, follows
@@ -46,7 +46,7 @@ def check_trials(found: object, rig: str) -> list[Trial]:
     given = [found] if isinstance(found, Trial) else found
     if isinstance(found, Trial | str | Mapping) or not isinstance(given, Iterable):
         raise HannesError(
-            f"{rig}.read returned {_kind(found)}; it must return a list of trials, one for each recording."
+            f"{rig}.read returned {kind_of(found)}; it must return a list of trials, one for each recording."
         )
     trials = list(given)
     if not trials:
@@ -56,7 +56,7 @@ def check_trials(found: object, rig: str) -> list[Trial]:
     strange = next((one for one in trials if not isinstance(one, Trial)), None)
     if strange is not None:
         raise HannesError(
-            f"{rig}.read returned a list with {_kind(strange)} in it; each must be a hannes_lab.trials.Trial."
+            f"{rig}.read returned a list with {kind_of(strange)} in it; each must be a hannes_lab.trials.Trial."
         )
     kept: list[Trial] = []
     without: list[str] = []
@@ -68,10 +68,6 @@ def check_trials(found: object, rig: str) -> list[Trial]:
     if not kept:
         raise NoClosure(without[0].removeprefix("left out: "))
     return unique_names([replace(kept[0], notes=(*kept[0].notes, *without)), *kept[1:]], conditions=False)
-
-
-def _kind(value: object) -> str:
-    return "nothing (None)" if value is None else f"a {type(value).__name__}"
 
 
 def _checked(trial: Trial, where: str) -> Trial:
@@ -100,7 +96,7 @@ def _numbers(values: object, what: str, hint: str) -> Array:
     try:
         row = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise HannesError(f"{what} must be a row of numbers, not {_kind(values)} ({error}).") from error
+        raise HannesError(f"{what} must be a row of numbers, not {kind_of(values)} ({error}).") from error
     if row.ndim != 1:
         raise HannesError(f"{what} has the shape {row.shape}; it must be one row of numbers.")
     bad = np.flatnonzero(~np.isfinite(row))
@@ -150,7 +146,7 @@ def _closures(trial: Trial, where: str) -> tuple[Closure, ...]:
     for number, closure in enumerate(closures):
         if not isinstance(closure, Closure):
             raise HannesError(
-                f"{where}: closure {number + 1} is {_kind(closure)}; give Closure(start, stop, condition)."
+                f"{where}: closure {number + 1} is {kind_of(closure)}; give Closure(start, stop, condition)."
             )
         if not closure.stop - closure.start >= SHORTEST * trial.period * (1.0 - 1e-9):
             raise HannesError(
@@ -293,7 +289,7 @@ def _check_parts(trial: Trial, where: str) -> None:
     """Parts that begin anew must be what a simulation of the first can stand for."""
     wrong = next((part for part in trial.parts if not isinstance(part, Part)), None)
     if wrong is not None:
-        raise HannesError(f"{where}: its parts must be hannes_lab.trials.Part, not {_kind(wrong)}.")
+        raise HannesError(f"{where}: its parts must be hannes_lab.trials.Part, not {kind_of(wrong)}.")
     if stands_for_all(trial):
         return
     many = (

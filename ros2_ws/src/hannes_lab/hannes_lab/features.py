@@ -181,6 +181,11 @@ def _logged(rig: Rig) -> str:
     return f"{type(rig).__name__}.logged"
 
 
+def kind_of(value: object) -> str:
+    """What a value of the wrong type is, in words."""
+    return "nothing (None)" if value is None else f"a {type(value).__name__}"
+
+
 def check_simulated(
     signals: Mapping[str, Array], wanted: Sequence[str], trial: Trial, ticks: int, rig: Rig
 ) -> None:
@@ -190,8 +195,9 @@ def check_simulated(
     """
     who = f"{_logged(rig)}, trial '{trial.name}'"
     if not isinstance(signals, Mapping):
-        what = "nothing (None)" if signals is None else f"a {type(signals).__name__}"
-        raise HannesError(f"{who}: it returned {what}; it must return a mapping of signals, name -> values.")
+        raise HannesError(
+            f"{who}: it returned {kind_of(signals)}; it must return a mapping of signals, name -> values."
+        )
     missing = [name for name in wanted if name not in signals]
     if missing:
         raise HannesError(
