@@ -124,6 +124,30 @@ def test_friction_within_reach_of_the_tolerance_is_no_effect_but_is_pointed_at()
     )
 
 
+def test_the_zero_that_recordings_of_a_hand_share_counts_once() -> None:
+    """The hand of this seed reads 0.030 rad where it is open, three tolerances, in all three recordings."""
+    model = Model.load()
+    slack = load_effect("wire_slack").entry({"slack": 0.0213})
+    trials = [make_trial(r) for r in make_set(model, [slack], seed=50_120)[0]]
+    prepared = prepare(trials, model)
+    where = trials[0]
+    shared, own = (
+        prepared.rig.simulate(model, {name: 0.03}, where, where.reference)["encoder_position"]
+        for name in ("encoder.hand_zero", f"encoder.zero@{where.name}")
+    )
+    assert np.array_equal(shared, own)
+    assert (
+        np.ptp(shared - prepared.rig.simulate(model, {}, where, where.reference)["encoder_position"]) > 1e-3
+    )
+
+    found = diagnose(prepared, {n: n for n in ("wire_slack", "encoder_offset")}, max_effects=2)
+    assert [e.name for e in found.effects] == ["wire_slack"] and found.verdict == "effects"
+    assert found.nuisances["encoder.hand_zero"]["value"] == pytest.approx(0.030, abs=0.015)
+
+    alone = prepare(trials[:1], model)
+    assert "encoder.hand_zero" not in {n.name for n in alone.nuisances}
+
+
 def test_an_effect_that_a_later_one_made_superfluous_is_dropped() -> None:
     prepared, _ = data(["glove_stiffness"], seed=102)
     search = Search(

@@ -53,6 +53,11 @@ WIDE_STEP = 0.1
 _UNKNOWN_ZERO_SD = 0.1
 """rad; what a hand calls open whose homing nobody described."""
 
+_ZERO = "encoder.zero"
+HAND_ZERO = "encoder.hand_zero"
+"""The part of the encoder's zero that described recordings of one hand share; each has its own beside it, as the hand
+may have been homed anew.  Without it the tolerance would be charged once per recording."""
+
 HOMING = "encoder.homing"
 _UNKNOWN_HOMING_SD = 1.0
 """rad; how far the wire is wound up, and the hand off its open stop, where an encoder reads zero whose homing nobody
@@ -200,7 +205,9 @@ class HandRig(PlantRig):
                         out.append(
                             Nuisance(place, plant.get(damping), _UNKNOWN_DAMPING_SD, True, step=WIDE_STEP)
                         )
-            elif name == "encoder.zero":
+            elif name == _ZERO:
+                if sum(map(is_described, self.trials)) > 1:
+                    out.append(Nuisance(HAND_ZERO, 0.0, sd, False, unit="rad"))
                 out += [
                     Nuisance(
                         f"{name}@{trial.name}",
@@ -286,7 +293,7 @@ class HandRig(PlantRig):
         """The rollout itself; gains of the controller and the clock of the reference may be among the values."""
         of_plant: dict[str, float] = {}
         gains: dict[str, float] = {}
-        delay = lead = homing = 0.0
+        delay = lead = shift = wound = 0.0
         for name, value in values.items():
             if name.startswith("control."):
                 gains[name.removeprefix("control.")] = value
@@ -294,16 +301,18 @@ class HandRig(PlantRig):
                 delay = value
             elif name == REFERENCE_LEAD and not is_described(trial):
                 lead = value
+            elif name == HAND_ZERO:
+                shift += value if is_described(trial) else 0.0
             elif name == HOMING:
-                homing = 0.0 if is_described(trial) else value
+                wound = 0.0 if is_described(trial) else value
             elif not name.startswith("log."):
                 of_plant[name] = value
         before = None
-        if homing:
-            if trial.closures[0].start < WINDING:
-                before = np.full(round(WINDING / trial.period), reference[0])
-            zero = f"encoder.zero@{trial.name}"
-            of_plant[zero] = of_plant.get(zero, 0.0) - homing
+        if wound and trial.closures[0].start < WINDING:
+            before = np.full(round(WINDING / trial.period), reference[0])
+        if shift != wound:
+            zero = f"{_ZERO}@{trial.name}"
+            of_plant[zero] = of_plant.get(zero, 0.0) + shift - wound
         _, controller, _ = self._plant(model, trial)
         if isinstance(controller, DoublePID):
             controller.parameters[:] = replace(controller.settings, **gains).to_array()
