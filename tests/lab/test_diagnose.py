@@ -205,9 +205,9 @@ def test_a_friction_that_makes_the_hand_stick_is_fitted() -> None:
         prepared.problem, prepared.model, prepared.nuisances, effect_sources(only=["joint_friction"])
     )
     null = search.null()
-    assert null.pulled
+    assert null.fit.z_of("hand.coulomb") > 8.0, "which has the same form, far beyond its tolerance"
     found = search.add(null, "joint_friction")
-    assert found.fit.cost < 0.05 * null.fit.cost
+    assert found.fit.cost < 0.7 * null.fit.cost and abs(found.fit.z_of("hand.coulomb")) < 4.0
     assert found.fit.values["joint_friction.level"] == pytest.approx(
         truth.effects[0].values["level"], rel=0.1
     )

@@ -12,10 +12,11 @@ from hannes_bringup.cli import main
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.fit import fit
 from hannes_lab.prepare import Prepared, prepare
-from hannes_lab.rig import linear_unit, load_rig, scaled_effect, unit_factor
+from hannes_lab.rig import Nuisance, linear_unit, load_rig, scaled_effect, unit_factor
 from hannes_lab.screen import usable_effects
-from hannes_lab.search import Search
+from hannes_lab.search import Candidate, Search
 from hannes_lab.spectrum import position_periods
 from hannes_lab.trials import find_moves
 from hannes_sim.effect import catalogue, load_effect
@@ -97,6 +98,24 @@ def test_a_ripple_is_seen_in_the_spectrum_over_the_position(prepared: Prepared) 
     best = search.add(search.null(), "coulomb_friction")
     periods = position_periods(prepared.problem, best.fit, 1e-3, 0.1)
     assert periods and periods[0] == pytest.approx(PERIOD, rel=0.02)
+
+
+def test_what_only_scales_with_all_else_is_led_back_to_its_tolerance(prepared: Prepared) -> None:
+    """The command does not tell the force constant from mass and friction: only its tolerance does."""
+    kt = Nuisance("motor.kt", 1.0, 0.03, False, unit="N/V", lower=0.01)
+    names = ("coulomb_friction", "cogging")
+    search = Search(prepared.problem, prepared.model, (*prepared.nuisances, kt), {n: n for n in names})
+    problem = search.problem
+    near = search.fitted(names).fit
+    factor = {c.name: 1.0 if c.name.endswith("period") else 1.4 for c in near.coordinates}
+    scaled = {c.name: c.z(factor[c.name] * near.values[c.name]) for c in near.coordinates}
+    away = fit(problem, near.model, near.coordinates, scaled, evaluations=1)
+    assert away.z_of("motor.kt") > 10.0 and away.misfit == pytest.approx(near.misfit, rel=0.01)
+    back = search.polish(Candidate(names, away, away.cost)).fit
+    assert abs(back.z_of("motor.kt")) < 1.0 and back.cost < away.cost - 100.0
+    for name in ("motor.armature", "coulomb_friction.level"):
+        part = back.values[name] / away.values[name]
+        assert part == pytest.approx(back.values["motor.kt"] / away.values["motor.kt"], rel=0.02)
 
 
 @pytest.mark.slow

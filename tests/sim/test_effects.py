@@ -12,7 +12,7 @@ from hannes_description.model import Model
 from hannes_sim.effect import Effect, EffectParameter, catalogue, evaluate, load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.objects import OBJECTS
-from hannes_sim.ports import CURRENT, DAMPING, DT, FRICTION, LOAD, QL, RESISTANCE, SLACK, V
+from hannes_sim.ports import CURRENT, DAMPING, DT, FRICTION, LOAD, LOAD_FRICTION, QL, RESISTANCE, SLACK, V
 from hannes_sim.rollout import Rollout, rollout
 
 NAMES = sorted(catalogue())
@@ -78,7 +78,7 @@ def test_every_parameter_moves_an_output(name: str) -> None:
     }
     base = runs(Model.load().with_effect(effect.entry(strong)))
     for p in effect.parameters:
-        value = p.vanishing if p.vanishing is not None else min(p.upper, 1.7 * strong[p.name])
+        value = p.vanishing if p.vanishing is not None else min(p.upper, 1.7 * strong[p.name] or p.upper)
         moved = runs(Model.load().with_effect(effect.entry({**strong, p.name: value})))
         change = max(np.abs(a.raw - b.raw).max() for a, b in zip(base, moved, strict=True))
         assert change > 1e-6, f"{name}.{p.name} moves nothing"
@@ -104,9 +104,12 @@ def test_equations_by_hand() -> None:
     assert [
         evaluate(load_effect("velocity_strengthening"), rising, {V: v})[FRICTION] for v in (0.0, 0.1, 2.0)
     ] == pytest.approx([-0.02, -0.02 / math.e, 0.0])
-    assert evaluate(load_effect("load_dependent_friction"), {"coefficient": 0.1}, {LOAD: 0.3})[
-        FRICTION
-    ] == pytest.approx(0.03)
+    guided = evaluate(load_effect("load_dependent_friction"), {"coefficient": 0.1}, {LOAD: 0.3})
+    assert guided[FRICTION] == pytest.approx(0.03) and guided[LOAD_FRICTION] == 0.0
+    guided = evaluate(
+        load_effect("load_dependent_friction"), {"coefficient": 0.1, "share": 0.75}, {LOAD: 0.3}
+    )
+    assert guided[[FRICTION, LOAD_FRICTION]] == pytest.approx([0.0075, 0.0225])
     glove = evaluate(load_effect("glove_stiffness"), {"stiffness": 1e-3, "hardening": 1e-6}, {QL: 10.0})
     assert glove.sum() == pytest.approx(-(1e-3 * 10 + 1e-6 * 1000))
     states = np.zeros(1)

@@ -82,6 +82,11 @@ repeatability, falls to this part; where more is left, what is missing is someth
 
 NO_REPEATS = "There is one closure of each condition only: nothing could be held out, and the repeatability is a guess."
 
+ANY_DIFFERENCE = (
+    "a difference of any size counts here that chance does not explain; no simple model of a real machine is that exact: "
+    "--greedy adds effects for as long as the error on conditions that were left out of the fit falls"
+)
+
 MANY_FAILURES = 0.05
 """Part of the simulations that did not stay finite from which on their parameters are worth a look."""
 
@@ -320,6 +325,11 @@ def diagnose(
         notes=(
             *prepared.notes,
             *choice.notes,
+            *(
+                [ANY_DIFFERENCE]
+                if verdict == "unknown" and not (greedy or search.problem.discrepancy)
+                else ()
+            ),
             *_inseparable(search, experiments),
             *_end_notes(best),
             *_undescribed(best),

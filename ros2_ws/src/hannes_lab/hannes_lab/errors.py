@@ -203,7 +203,14 @@ class Fixed(Problem):
     """A problem in which some parameters are held."""
 
     def __init__(self, problem: Problem, held: Mapping[str, float]) -> None:
-        super().__init__(problem.rig, problem.features, problem.whitener, problem.deviations)
+        super().__init__(
+            problem.rig,
+            problem.features,
+            problem.whitener,
+            problem.deviations,
+            problem.counts,
+            problem.discrepancy,
+        )
         self._held = dict(held)
 
     def residual(self, model: Model, values: Mapping[str, float]) -> Array:

@@ -16,7 +16,7 @@ from hannes_sim.effect import EffectType, load_effect
 from numpy.typing import NDArray
 
 from .cache import Codec, NotPlain, Store, code_hash, content_hash
-from .errors import SignalError
+from .errors import Fixed, SignalError
 from .executor import Executor, Held, own
 from .fit import Fit, finite_differences, fit, over_its_spread, spread
 from .problem import (
@@ -168,7 +168,7 @@ class Search:
                 found = new
             if gain < least_gain(found, self.rows):
                 break
-        return found
+        return self._led_back(found)
 
     def with_effects(self, names: Names) -> tuple[Model, tuple[Coordinate, ...]]:
         """The model with the effects switched off but movable, and the coordinates to move."""
@@ -339,6 +339,8 @@ class Search:
 
     def _polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
         new = self._again(candidate.fit, evaluations)
+        if not self.slow:
+            new = self._led_back(new)
         if new.cost < candidate.fit.cost:
             cost = candidate.penalised - candidate.fit.cost + new.cost
             candidate = Candidate(candidate.names, new, cost)
@@ -357,6 +359,38 @@ class Search:
             steps=spread(old),
             evaluations=evaluations,
         )
+
+    def _led_back(self, found: Fit) -> Fit:
+        """A fit with parameters that are far off held at their nominal values and all else fitted again, where that
+        costs less.
+
+        Parameters that only act together (an efficiency, and the mass and friction that it drives) are told by their
+        priors alone.  While much is unexplained, a fit stays where that of a worse model had gone: what is bent or rough
+        in the derivatives makes the valley look like a slope.  With one of them held there is no valley.
+        """
+        tried: set[str] = set()
+        while True:
+            far = [
+                (abs(float(z)), c)
+                for c, z in zip(found.coordinates, found.z, strict=True)
+                if c.prior and not c.wide and c.name not in tried and abs(z) > PULLED
+            ]
+            if not far:
+                return found
+            held = max(far, key=lambda item: item[0])[1]
+            tried.add(held.name)
+            others = [c for c in found.coordinates if c is not held]
+            problem = Fixed(self.problem, {held.name: held.value(0.0)})
+            rest = fit(problem, found.model, others, found.point, rows=self.rows, evaluations=LONG)
+            if rest.cost < found.cost:
+                found = fit(
+                    self.problem,
+                    found.model,
+                    found.coordinates,
+                    {**rest.point, held.name: 0.0},
+                    rows=self.rows,
+                    evaluations=SHORT,
+                )
 
     def with_spread(self, candidate: Candidate) -> Candidate:
         """The candidate with the derivatives from which its intervals are made."""

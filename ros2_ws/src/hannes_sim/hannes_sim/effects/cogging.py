@@ -10,7 +10,7 @@ from ..ports import TORQUE, Q
 class Cogging(Effect):
     """A torque that is periodic in the motor side's angle.
 
-    Equation: tau = a sin(2 pi q / P) + b (cos(2 pi q / P) - 1), so that it is zero at the open hand.
+    Equation: tau = a sin(2 pi q / P) + b cos(2 pi q / P), of no mean, with any phase at the encoder's zero.
     Limits: one harmonic; with a sampling of the current below its frequency it is seen through the position only.
     """
 
@@ -37,4 +37,4 @@ class Cogging(Effect):
     @staticmethod
     def contribute(x: Any, p: Any, s: Any, y: Any) -> None:
         angle = 2.0 * math.pi * x[Q] / p[2]
-        y[TORQUE] += p[0] * math.sin(angle) + p[1] * (math.cos(angle) - 1.0)
+        y[TORQUE] += p[0] * math.sin(angle) + p[1] * math.cos(angle)
