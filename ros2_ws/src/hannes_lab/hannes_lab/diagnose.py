@@ -83,8 +83,8 @@ repeatability, falls to this part; where more is left, what is missing is someth
 NO_REPEATS = "There is one closure of each condition only: nothing could be held out, and the repeatability is a guess."
 
 ANY_DIFFERENCE = (
-    "a difference of any size counts here that chance does not explain; no simple model of a real machine is that exact: "
-    "--greedy adds effects for as long as the error on conditions that were left out of the fit falls"
+    "a difference of any size counts here that chance does not explain; no simple model of a real machine is that "
+    "exact: --greedy adds effects for as long as the error on conditions that were left out of the fit falls"
 )
 
 MANY_FAILURES = 0.05

@@ -17,6 +17,7 @@ from .fit import Fit, finite_differences, linear_minimum, prior_weights
 from .problem import Coordinate, Problem, effect_coordinates
 from .settle import seen_from
 from .spectrum import position_periods, whole_periods
+from .surrogate import AnchoredRig
 
 Array = NDArray[np.float64]
 Point = dict[str, float]
@@ -43,7 +44,7 @@ sticks fits in a narrow range of strengths only, which lies anywhere between the
 PITS = 8
 RIPPLES = 2
 """Of the periods at which a ripple promises more than at those beside it, so many are simulated, and so many are where
-fits start."""
+fits start; all of them if the base is off: a ripple that did that is not linear, and looks like one of a wave more."""
 
 NEAR = 2.0
 """A base whose nuisance parameters are all within so many standard deviations is scanned from where it is alone."""
@@ -95,11 +96,13 @@ class Scan:
         if farthest(base) > NEAR:
             places.append(self.at_nominal(base))
         best: list[Scored] = []
+        off = len(places) > 1 and not isinstance(self.problem.rig, AnchoredRig)
         lines = spectral_periods(kind, seen_from(self.problem, base), base)
         for place in places:
             scan = _Place(self, kind, place, model, coordinates)
             if period_of(kind):
-                best += scan.rippled(shapes_of(kind, (*lines, *tried_periods(kind, self.problem.features))))
+                shapes = shapes_of(kind, (*lines, *tried_periods(kind, self.problem.features)))
+                best += scan.rippled(shapes)[: PITS if off else RIPPLES]
             else:
                 every = scan.scored(shapes_of(kind), _strengths(kind), last=place is places[-1])
                 best.append(min(every, key=lambda item: item[0]))
@@ -181,13 +184,13 @@ class _Place:
                 yield self.score({**shape, name: z})
 
     def rippled(self, shapes: Sequence[Point]) -> list[Scored]:
-        """The best shapes of an effect with a period, by what all its strengths gain together, and what they cost."""
+        """The PITS best shapes of an effect with a period, by what all its strengths gain together, and what they cost."""
         steps: dict[str, float] = {}
         promised = [self.jointly(shape, steps) for shape in shapes]
         costs = np.array([np.inf, *(cost for cost, _ in promised), np.inf])
         pits = np.flatnonzero((costs[1:-1] <= costs[:-2]) & (costs[1:-1] <= costs[2:]))
         least = sorted((promised[k] for k in pits), key=lambda item: item[0])[:PITS]
-        return sorted((self.score(start) for _, start in least), key=lambda item: item[0])[:RIPPLES]
+        return sorted((self.score(start) for _, start in least), key=lambda item: item[0])
 
     def at(self, start: Mapping[str, float]) -> Array:
         z = {**self.here, **start}

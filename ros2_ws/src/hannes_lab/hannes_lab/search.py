@@ -365,8 +365,8 @@ class Search:
         costs less.
 
         Parameters that only act together (an efficiency, and the mass and friction that it drives) are told by their
-        priors alone.  While much is unexplained, a fit stays where that of a worse model had gone: what is bent or rough
-        in the derivatives makes the valley look like a slope.  With one of them held there is no valley.
+        priors alone.  While much is unexplained, a fit stays where that of a worse model had gone: what is bent or
+        rough in the derivatives makes the valley look like a slope.  With one of them held there is no valley.
         """
         tried: set[str] = set()
         while True:
