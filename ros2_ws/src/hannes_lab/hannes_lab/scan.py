@@ -184,7 +184,7 @@ class _Place:
                 yield self.score({**shape, name: z})
 
     def rippled(self, shapes: Sequence[Point]) -> list[Scored]:
-        """The PITS best shapes of an effect with a period, by what all its strengths gain together, and what they cost."""
+        """The PITS best shapes of an effect with a period by what all strengths gain together, and what they cost."""
         steps: dict[str, float] = {}
         promised = [self.jointly(shape, steps) for shape in shapes]
         costs = np.array([np.inf, *(cost for cost, _ in promised), np.inf])
