@@ -46,7 +46,7 @@ approximation behind the critical value.  Where the model has an error of its ow
 WORTHWHILE = 0.05
 """A further effect must remove at least this part of the cost, or of the mean square error on held-out conditions."""
 
-OWN_ERROR_PART = 0.1
+OWN_ERROR_PART = 0.12
 """The same where the model has an error of its own, also within chance: its width is assumed, and it is not noise.
 There a second effect must remove FURTHER times as much."""
 
