@@ -39,9 +39,11 @@ from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.errors import overall, repeatability, signal_errors, split_closures
 from hannes_lab.features import Features
 from hannes_lab.fit import fit
+from hannes_lab.hand import HAND_ZERO
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import Problem, nuisance_coordinate
+from hannes_lab.rig import Nuisance
 from hannes_lab.trials import make_trial
 from hannes_sim.effect import load_effect
 from joblib import Parallel, delayed
@@ -138,6 +140,11 @@ def judged(prepared: Prepared, model: Model, values: dict[str, float]) -> float:
     return overall(signal_errors(test, test.closures(prepared.rig, model, values), floor))
 
 
+def shared_out(prepared: Prepared) -> list[Nuisance]:
+    """The uncertain parameters without the zero that recordings share: priors alone tell it from that of each."""
+    return [n for n in prepared.nuisances if n.name != HAND_ZERO]
+
+
 # -- the methods ------------------------------------------------------------------------------------------------------
 def nominal(prepared: Prepared) -> dict[str, Any]:
     return {"error": judged(prepared, prepared.model, {}), "names": "-"}
@@ -146,7 +153,7 @@ def nominal(prepared: Prepared) -> dict[str, Any]:
 def parameters(prepared: Prepared) -> dict[str, Any]:
     """All uncertain parameters by scipy's least squares, without priors."""
     train, _ = split_closures(prepared.features)
-    coordinates = [replace(nuisance_coordinate(n), prior=False) for n in prepared.nuisances]
+    coordinates = [replace(nuisance_coordinate(n), prior=False) for n in shared_out(prepared)]
     found = fit(plain_problem(prepared, train), prepared.model, coordinates, {}, evaluations=60)
     return {"error": judged(prepared, prepared.model, found.values), "names": _moved(found.z, prepared)}
 
@@ -157,7 +164,7 @@ def sysid(prepared: Prepared) -> dict[str, Any]:
 
     train, _ = split_closures(prepared.features)
     problem = plain_problem(prepared, train)
-    coordinates = [nuisance_coordinate(n) for n in prepared.nuisances]
+    coordinates = [nuisance_coordinate(n) for n in shared_out(prepared)]
     wanted = toolbox.ParameterDict({
         c.name: toolbox.Parameter(c.name, nominal=0.0, min_value=-30.0, max_value=30.0) for c in coordinates
     })  # fmt: skip
@@ -181,7 +188,7 @@ def sysid(prepared: Prepared) -> dict[str, Any]:
 
 def _moved(z: Array, prepared: Prepared) -> str:
     """The model's own parameters that moved most, if by more than two standard deviations of what is usual."""
-    far = sorted(zip(np.abs(z), prepared.nuisances, strict=True), key=lambda item: -item[0])
+    far = sorted(zip(np.abs(z), shared_out(prepared), strict=True), key=lambda item: -item[0])
     names = [n.name for size, n in far if size > 2.0 and "@" not in n.name]
     return "moves " + ", ".join(names[:3]) if names else "-"
 

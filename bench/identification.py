@@ -49,6 +49,7 @@ SHAPES = {
     "glove_hysteresis": (0.05, 1.2, 10.0),
     "winding_heating": (4.0, 35.0, 300.0),
     "velocity_strengthening": (0.1, 0.6, 1.8),
+    "load_dependent_friction": (0.3, 0.7, 1.0),
 }
 """Values of each effect's one shape parameter."""
 LOGGED = (

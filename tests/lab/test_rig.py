@@ -207,6 +207,13 @@ def test_little_explained_is_unknown(prepared: Prepared) -> None:
     assert any("less than half would be an answer" in note for note in found.notes)
 
 
+def test_unknown_without_greedy_says_what_else_can_be_done(prepared: Prepared) -> None:
+    sources = effect_sources(only=["command_delay"])
+    found = diagnose(prepared, sources)
+    assert found.verdict == "unknown" and any("--greedy adds effects" in note for note in found.notes)
+    assert not any("--greedy adds" in note for note in diagnose(prepared, sources, greedy=True).notes)
+
+
 def test_the_model_file_says_what_is_printed(prepared: Prepared, tmp_path: Path) -> None:
     """Also where nothing was added: the file then holds the parameters with which the error was found."""
     found = diagnose(prepared, effect_sources(only=["coulomb_friction"]), greedy=True)

@@ -12,7 +12,20 @@ from hannes_description.model import Model
 from hannes_sim.effect import Effect, EffectParameter, catalogue, evaluate, load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.objects import OBJECTS
-from hannes_sim.ports import CURRENT, DAMPING, DT, FRICTION, LOAD, LOAD_FRICTION, QL, RESISTANCE, SLACK, V
+from hannes_sim.ports import (
+    CURRENT,
+    DAMPING,
+    DT,
+    FRICTION,
+    LOAD,
+    LOAD_FRICTION,
+    QL,
+    RESISTANCE,
+    SLACK,
+    TORQUE,
+    Q,
+    V,
+)
 from hannes_sim.rollout import Rollout, rollout
 
 NAMES = sorted(catalogue())
@@ -110,6 +123,10 @@ def test_equations_by_hand() -> None:
         load_effect("load_dependent_friction"), {"coefficient": 0.1, "share": 0.75}, {LOAD: 0.3}
     )
     assert guided[[FRICTION, LOAD_FRICTION]] == pytest.approx([0.0075, 0.0225])
+    ripple = {"sine": 0.01, "cosine": 0.02, "period": 3.0}
+    along = [evaluate(load_effect("cogging"), ripple, {Q: 3.0 * k / 8})[TORQUE] for k in range(8)]
+    assert along[0] == pytest.approx(0.02) and along[2] == pytest.approx(0.01)
+    assert sum(along) == pytest.approx(0.0, abs=1e-12)
     glove = evaluate(load_effect("glove_stiffness"), {"stiffness": 1e-3, "hardening": 1e-6}, {QL: 10.0})
     assert glove.sum() == pytest.approx(-(1e-3 * 10 + 1e-6 * 1000))
     states = np.zeros(1)
@@ -190,9 +207,11 @@ def test_no_strength_within_the_bounds_upsets_the_integration(name: str, grasp: 
     """Also far above the typical strength, where a search looks too, half the step gives nearly the same current."""
     kind = load_effect(name)
     reference = half_sine(period=1.2)[:1200]
-    for factor in (1.0, 16.0, 1e9):
+    for factor, part in ((1.0, 0.0), (16.0, 0.5), (1e9, 1.0)):
         values = {
-            p.name: float(np.clip(p.typical * (factor if p.vanishing is not None else 1.0), p.lower, p.upper))
+            p.name: part
+            if p.part
+            else float(np.clip(p.typical * (factor if p.vanishing is not None else 1.0), p.lower, p.upper))
             for p in kind.parameters
         }
         model = Model.load("nominal").with_effect(kind.entry(values))

@@ -581,7 +581,7 @@ def calibrate(
 ) -> Calibration:
     """Calibrate named parameters on recordings.
 
-    Beside them, what belongs to the recording alone (place and stiffness of its object, zero of its encoder; clock,
+    Beside them, what belongs to the recording alone (place and stiffness of its object, zeros of its encoder; clock,
     logger and gains where it does not describe them) is fitted with its own prior.  The noise is estimated anew where
     the searches end, and the best of them goes on from there.  Held-out error: every second closure takes no part in a
     further fit.

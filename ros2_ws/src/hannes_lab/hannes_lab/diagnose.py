@@ -325,11 +325,7 @@ def diagnose(
         notes=(
             *prepared.notes,
             *choice.notes,
-            *(
-                [ANY_DIFFERENCE]
-                if verdict == "unknown" and not (greedy or search.problem.discrepancy)
-                else ()
-            ),
+            *_any_difference(search, verdict, greedy),
             *_inseparable(search, experiments),
             *_end_notes(best),
             *_undescribed(best),
@@ -499,7 +495,7 @@ def _implausible(candidate: Candidate) -> str:
     far = [
         (abs(float(z)), c)
         for c, z in zip(candidate.fit.coordinates, candidate.fit.z, strict=True)
-        if c.prior and not c.wide and "@" not in c.name
+        if c.prior and not c.wide and c.name in candidate.fit.model.parameters
     ]
     off, c = max(far, key=lambda item: item[0], default=(0.0, None))
     if c is None or off <= IMPLAUSIBLE:
@@ -771,6 +767,13 @@ def _failed(problem: Problem) -> list[str]:
         f"{problem.failures} of {problem.simulations} simulations did not stay finite and counted as very bad fits "
         f"({meaning})"
     ]
+
+
+def _any_difference(search: Search, verdict: str, greedy: bool) -> list[str]:
+    """What else can be tried where chance does not explain what is left, and the model may be off by nothing."""
+    problem = search.problem
+    may = verdict == "unknown" and not greedy and not problem.discrepancy
+    return [ANY_DIFFERENCE] if may and len(problem.features.conditions) > 1 else []
 
 
 def _inseparable(search: Search, experiments: Sequence[Experiment]) -> list[str]:

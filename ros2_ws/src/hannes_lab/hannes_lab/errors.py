@@ -175,8 +175,8 @@ def held_out_condition_errors(
 ) -> dict[str, tuple[SignalError, ...]]:
     """Errors on each condition when it took no part in the fit.
 
-    Parameters of the held-out recording alone (its object, its encoder zero: `name@condition`) cannot be known from the
-    others; they are then fitted on the held-out condition with everything else kept.
+    Parameters of the held-out recording alone (its object, its own encoder zero: `name@condition`) cannot be known from
+    the others; they are then fitted on the held-out condition with everything else kept.
 
     known   derivatives (size,) by coordinate name that are taken as constant
     """

@@ -302,7 +302,7 @@ class HandRig(PlantRig):
             elif name == REFERENCE_LEAD and not is_described(trial):
                 lead = value
             elif name == HAND_ZERO:
-                shift += value if is_described(trial) else 0.0
+                shift = value if is_described(trial) else 0.0
             elif name == HOMING:
                 wound = 0.0 if is_described(trial) else value
             elif not name.startswith("log."):
@@ -310,7 +310,7 @@ class HandRig(PlantRig):
         before = None
         if wound and trial.closures[0].start < WINDING:
             before = np.full(round(WINDING / trial.period), reference[0])
-        if shift != wound:
+        if shift or wound:
             zero = f"{_ZERO}@{trial.name}"
             of_plant[zero] = of_plant.get(zero, 0.0) + shift - wound
         _, controller, _ = self._plant(model, trial)

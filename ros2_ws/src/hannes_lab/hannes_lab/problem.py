@@ -51,6 +51,7 @@ class Coordinate:
 
     prior    True for a nuisance parameter with a standard normal prior on z
     scale    value = offset + scale z, or offset exp(scale z) if log
+    part     True for a part of a whole
     """
 
     name: str
@@ -62,6 +63,7 @@ class Coordinate:
     prior: bool
     step: float
     unit: str = ""
+    part: bool = False
 
     @property
     def wide(self) -> bool:
@@ -100,10 +102,14 @@ class Coordinate:
         return low, high
 
     def at_end(self, z: float) -> bool:
-        """True close to an end of a finite range, other than where an effect is switched off."""
+        """True close to an end of a finite range, other than where an effect is switched off or a part is all of it."""
         low, high = self.bounds
         near = AT_END * (high - low)
-        return bool(np.isfinite(near)) and any(abs(z - end) <= near for end in (low, high) if end != 0.0)
+        return (
+            bool(np.isfinite(near))
+            and not self.part
+            and any(abs(z - end) <= near for end in (low, high) if end != 0.0)
+        )
 
 
 def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
@@ -135,12 +141,9 @@ def effect_coordinates(effect: EffectType) -> list[Coordinate]:
             )
         else:
             away = p.vanishing or 0.0
-            scale = abs(p.typical - away) or 0.05 * (p.upper - p.lower)
-            out.append(
-                Coordinate(
-                    f"{effect.name}.{p.name}", away, scale, False, p.lower, p.upper, False, 0.03, p.unit
-                )
-            )
+            scale = abs(p.typical - away) or (0.25 if p.part else 0.05) * (p.upper - p.lower)
+            name = f"{effect.name}.{p.name}"
+            out.append(Coordinate(name, away, scale, False, p.lower, p.upper, False, 0.03, p.unit, p.part))
     return out
 
 

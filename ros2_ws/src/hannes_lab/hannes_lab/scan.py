@@ -44,7 +44,8 @@ sticks fits in a narrow range of strengths only, which lies anywhere between the
 PITS = 8
 RIPPLES = 2
 """Of the periods at which a ripple promises more than at those beside it, so many are simulated, and so many are where
-fits start; all of them if the base is off: a ripple that did that is not linear, and looks like one of a wave more."""
+fits start, from each place; all of them if the base is off: a ripple that did that is not linear, and looks like one of
+a wave more or less within the travel."""
 
 NEAR = 2.0
 """A base whose nuisance parameters are all within so many standard deviations is scanned from where it is alone."""
@@ -93,16 +94,17 @@ class Scan:
         kind                what is added; `model` and `coordinates` are those of the base with it
         """
         places = [base, *self.minima.get(point_key(base), ())]
-        if farthest(base) > NEAR:
+        off = farthest(base) > NEAR
+        if off:
             places.append(self.at_nominal(base))
         best: list[Scored] = []
-        off = len(places) > 1 and not isinstance(self.problem.rig, AnchoredRig)
+        all_pits = off and not isinstance(self.problem.rig, AnchoredRig)
         lines = spectral_periods(kind, seen_from(self.problem, base), base)
         for place in places:
             scan = _Place(self, kind, place, model, coordinates)
             if period_of(kind):
                 shapes = shapes_of(kind, (*lines, *tried_periods(kind, self.problem.features)))
-                best += scan.rippled(shapes)[: PITS if off else RIPPLES]
+                best += scan.rippled(shapes)[: PITS if all_pits else RIPPLES]
             else:
                 every = scan.scored(shapes_of(kind), _strengths(kind), last=place is places[-1])
                 best.append(min(every, key=lambda item: item[0]))

@@ -338,9 +338,7 @@ class Search:
         return self._known(found)
 
     def _polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
-        new = self._again(candidate.fit, evaluations)
-        if not self.slow:
-            new = self._led_back(new)
+        new = self._led_back(self._again(candidate.fit, evaluations))
         if new.cost < candidate.fit.cost:
             cost = candidate.penalised - candidate.fit.cost + new.cost
             candidate = Candidate(candidate.names, new, cost)
@@ -362,35 +360,40 @@ class Search:
 
     def _led_back(self, found: Fit) -> Fit:
         """A fit with parameters that are far off held at their nominal values and all else fitted again, where that
-        costs less.
+        costs less; a slow plant's stays as it is.
 
         Parameters that only act together (an efficiency, and the mass and friction that it drives) are told by their
         priors alone.  While much is unexplained, a fit stays where that of a worse model had gone: what is bent or
         rough in the derivatives makes the valley look like a slope.  With one of them held there is no valley.
         """
         tried: set[str] = set()
-        while True:
+        while not self.slow:
             far = [
                 (abs(float(z)), c)
                 for c, z in zip(found.coordinates, found.z, strict=True)
-                if c.prior and not c.wide and c.name not in tried and abs(z) > PULLED
+                if c.prior and not c.wide and "@" not in c.name and c.name not in tried and abs(z) > PULLED
             ]
             if not far:
-                return found
+                break
             held = max(far, key=lambda item: item[0])[1]
             tried.add(held.name)
             others = [c for c in found.coordinates if c is not held]
             problem = Fixed(self.problem, {held.name: held.value(0.0)})
-            rest = fit(problem, found.model, others, found.point, rows=self.rows, evaluations=LONG)
+            rest = fit(
+                problem,
+                found.model,
+                others,
+                found.point,
+                rows=self.rows,
+                evaluations=LONG,
+            )
             if rest.cost < found.cost:
-                found = fit(
-                    self.problem,
-                    found.model,
-                    found.coordinates,
-                    {**rest.point, held.name: 0.0},
-                    rows=self.rows,
-                    evaluations=SHORT,
+                whole = {**rest.point, held.name: 0.0}
+                again = fit(
+                    self.problem, found.model, found.coordinates, whole, rows=self.rows, evaluations=SHORT
                 )
+                found = min(found, again, key=lambda f: f.cost)
+        return found
 
     def with_spread(self, candidate: Candidate) -> Candidate:
         """The candidate with the derivatives from which its intervals are made."""
@@ -419,7 +422,7 @@ class Search:
 
     def _refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
         """A candidate of another problem (other noise), fitted in this one from its point."""
-        return _candidate(candidate.names, self._again(candidate.fit, evaluations))
+        return _candidate(candidate.names, self._led_back(self._again(candidate.fit, evaluations)))
 
     def without(self, larger: Candidate, names: Names) -> Candidate:
         """A part of a set, fitted again from where the larger one ended, or its known fit if that costs less."""

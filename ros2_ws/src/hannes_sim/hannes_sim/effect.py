@@ -41,6 +41,7 @@ class EffectParameter:
     starts         values from which a search starts, where the error has several minima; without them a strength is
                    searched at multiples of its typical value
     description    what it is
+    part           True for a part of a whole: both ends of its range are values like any other
     period         True for a period in the motor's position: a search also starts from the lines in the spectrum of
                    the residual over the position
     """
@@ -54,6 +55,7 @@ class EffectParameter:
     description: str = ""
     starts: tuple[float, ...] = ()
     period: bool = False
+    part: bool = False
 
     def __post_init__(self) -> None:
         if not self.lower <= self.typical <= self.upper:

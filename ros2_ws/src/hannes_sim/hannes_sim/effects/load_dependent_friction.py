@@ -27,6 +27,7 @@ class LoadDependentFriction(Effect):
             None,
             "part of it that acts on the hand's side of the wire",
             starts=(0.0, 1.0),
+            part=True,
         ),
     )
     looks_like = (
