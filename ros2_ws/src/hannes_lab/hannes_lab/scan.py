@@ -100,13 +100,13 @@ class Scan:
         best: list[Scored] = []
         all_pits = off and not isinstance(self.problem.rig, AnchoredRig)
         lines = spectral_periods(kind, seen_from(self.problem, base), base)
+        shapes = shapes_of(kind, (*lines, *tried_periods(kind, self.problem.features)))
         for place in places:
             scan = _Place(self, kind, place, model, coordinates)
             if period_of(kind):
-                shapes = shapes_of(kind, (*lines, *tried_periods(kind, self.problem.features)))
                 best += scan.rippled(shapes)[: PITS if all_pits else RIPPLES]
             else:
-                every = scan.scored(shapes_of(kind), _strengths(kind), last=place is places[-1])
+                every = scan.scored(shapes, _strengths(kind), last=place is places[-1])
                 best.append(min(every, key=lambda item: item[0]))
         return sorted(best, key=lambda item: item[0])
 

@@ -379,14 +379,7 @@ class Search:
             tried.add(held.name)
             others = [c for c in found.coordinates if c is not held]
             problem = Fixed(self.problem, {held.name: held.value(0.0)})
-            rest = fit(
-                problem,
-                found.model,
-                others,
-                found.point,
-                rows=self.rows,
-                evaluations=LONG,
-            )
+            rest = fit(problem, found.model, others, found.point, rows=self.rows, evaluations=LONG)
             if rest.cost < found.cost:
                 whole = {**rest.point, held.name: 0.0}
                 again = fit(
