@@ -22,7 +22,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from hannes_description.model import Model
 from hannes_lab.cache import Store
-from hannes_lab.diagnose import Diagnosis, diagnose, effect_sources
+from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.errors import pooled_repeatability
 from hannes_lab.executor import Executor
 from hannes_lab.inverse import force_residual, rows

@@ -9,7 +9,7 @@ import pytest
 from hannes_description.model import Model
 from hannes_lab.cli import _relative_error
 from hannes_lab.compare import MetricRow
-from hannes_lab.diagnose import _failed
+from hannes_lab.wording import failure_notes
 from hannes_sim.effect import load_effect
 from lab.foreign_bags import hannes
 
@@ -183,11 +183,11 @@ def test_a_relative_error_can_be_read(measured: float, sd: float, model: float, 
 
 def test_simulations_that_failed_are_harmless_where_they_are_few() -> None:
     counts = SimpleNamespace(failures=3, simulations=1000)
-    assert "3 of 1000 simulations" in _failed(counts)[0] and "harmless" in _failed(counts)[0]
+    assert "3 of 1000 simulations" in failure_notes(counts)[0] and "harmless" in failure_notes(counts)[0]
     counts.failures = 60
-    assert "harmless" not in _failed(counts)[0] and "above 5 %" in _failed(counts)[0]
+    assert "harmless" not in failure_notes(counts)[0] and "above 5 %" in failure_notes(counts)[0]
     counts.failures = 0
-    assert not _failed(counts)
+    assert not failure_notes(counts)
 
 
 def test_effects_that_the_model_has_are_not_looked_for_in_silence(

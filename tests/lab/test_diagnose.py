@@ -10,8 +10,10 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.add import add_effects
 from hannes_lab.chance import chance
+from hannes_lab.choose import Choice, pruned
 from hannes_lab.compare import compare
-from hannes_lab.diagnose import Diagnosis, _Choice, _pruned, diagnose, effect_sources
+from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.fit import Fit, fit
 from hannes_lab.hide import DEFAULT_CONDITIONS, Truth, make_set
 from hannes_lab.prepare import Prepared, prepare
@@ -159,7 +161,7 @@ def test_an_effect_that_a_later_one_made_superfluous_is_dropped() -> None:
     null = search.null()
     limits = chance(search.problem, null.fit, search.signatures(null))
     both = search.fitted(("gravity", "glove_stiffness"))
-    kept = _pruned(_Choice(search, both, limits, True, ()))
+    kept = pruned(Choice(search, both, limits, True, ()))
     assert kept.best.names == ("glove_stiffness",)
     assert kept.best.penalised < both.penalised + limits.gain
 

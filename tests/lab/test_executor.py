@@ -15,7 +15,8 @@ import pytest
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.cache import NotPlain, Store, content_hash
-from hannes_lab.diagnose import Diagnosis, diagnose, effect_sources
+from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.executor import Executor
 from hannes_lab.hide import make_set, write_set
 from hannes_lab.prepare import Prepared, load_trials, prepare

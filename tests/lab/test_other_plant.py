@@ -7,16 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hannes_description.model import Model
+from hannes_lab.adequacy import OWN_ERROR_MOST, is_adequate, shortfall, worst_error
 from hannes_lab.chance import chance
-from hannes_lab.diagnose import (
-    OWN_ERROR_MOST,
-    Diagnosis,
-    _adequate,
-    _short_of,
-    _worst,
-    diagnose,
-    effect_sources,
-)
+from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.search import Search
@@ -56,8 +50,8 @@ def test_an_error_in_one_signal_of_one_condition_is_not_lost_in_the_sum_over_all
     search = Search(prepared.problem, prepared.model, prepared.nuisances, {})
     null = search.null()
     limits = chance(search.problem, null.fit, {})
-    where, error = _worst(search, null)
-    assert error < 1.0 and _adequate(search, null, limits)
+    where, error = worst_error(search, null)
+    assert error < 1.0 and is_adequate(search, null, limits)
 
     problem, k = search.problem, 2
     block, rows = problem.features.blocks[k], problem.features.slices[k]
@@ -66,11 +60,11 @@ def test_an_error_in_one_signal_of_one_condition_is_not_lost_in_the_sum_over_all
     wave = 3.0 * problem.whiten(wave)
     off = replace(null, fit=replace(null.fit, residual=wave, cost=float(wave @ wave)))
     assert off.fit.cost < limits.misfit, "in the sum it is small"
-    where, error = _worst(search, off)
+    where, error = worst_error(search, off)
     assert where == f"{block.signal} of '{block.condition}'"
     assert error == pytest.approx(3.0) and error > OWN_ERROR_MOST
-    assert not _adequate(search, off, limits)
-    said = _short_of(search, off, limits)
+    assert not is_adequate(search, off, limits)
+    said = shortfall(search, off, limits)
     assert said.startswith(f"error in {where} is 3.0 times"), said
 
 

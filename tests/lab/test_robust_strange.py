@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from hannes_bags.reading import read_bag
 from hannes_description.model import EffectEntry, Model
+from hannes_lab.adequacy import is_adequate, shortfall
 from hannes_lab.calibrate import calibrate
 from hannes_lab.chance import chance
-from hannes_lab.diagnose import Diagnosis, _adequate, _short_of, diagnose, effect_sources
+from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.executor import Executor
 from hannes_lab.fit import Fit
 from hannes_lab.grasp import _seen, with_seen_objects
@@ -256,11 +258,11 @@ def test_one_hand_whose_zero_is_elsewhere_in_each_recording_explains_nothing(tmp
         z[zeros] += by
         return replace(null, fit=replace(null.fit, z=z))
 
-    assert len(zeros) == 3 and _adequate(search, null, limits)
-    assert _adequate(search, moved([15.0, 15.0, 15.0]), limits)
-    assert not _adequate(search, moved([0.0, 0.0, 15.0]), limits)
-    assert not _adequate(search, moved([0.0, 0.0, 7.5]), limits), "five from their mean"
-    said = _short_of(search, moved([0.0, 0.0, 15.0]), limits)
+    assert len(zeros) == 3 and is_adequate(search, null, limits)
+    assert is_adequate(search, moved([15.0, 15.0, 15.0]), limits)
+    assert not is_adequate(search, moved([0.0, 0.0, 15.0]), limits)
+    assert not is_adequate(search, moved([0.0, 0.0, 7.5]), limits), "five from their mean"
+    said = shortfall(search, moved([0.0, 0.0, 15.0]), limits)
     assert said == "encoder.zero differs between recordings of one machine by 10 times its tolerance"
 
 
@@ -277,12 +279,12 @@ def test_a_set_that_needs_a_hand_far_outside_the_tolerances_explains_nothing(tmp
         z[names.index(name)] = off
         return replace(null, fit=replace(null.fit, z=z))
 
-    assert _adequate(search, at("friction.coulomb", -7.5), limits)
-    assert not _adequate(search, at("friction.coulomb", -9.0), limits)
-    said = _short_of(search, at("friction.coulomb", -9.0), limits)
+    assert is_adequate(search, at("friction.coulomb", -7.5), limits)
+    assert not is_adequate(search, at("friction.coulomb", -9.0), limits)
+    said = shortfall(search, at("friction.coulomb", -9.0), limits)
     assert said.startswith("friction.coulomb would be ") and "9 times its tolerance off" in said, said
     assert "calibrate" in said
-    assert _adequate(search, at("control.current_kp", 9.0), limits), "of this nothing is known beforehand"
+    assert is_adequate(search, at("control.current_kp", 9.0), limits), "of this nothing is known beforehand"
 
 
 @pytest.mark.slow

@@ -12,8 +12,10 @@ from hannes_sim.effect import load_effect
 from hannes_sim.plant import PlantDiverged
 
 from .chance import chance
-from .diagnose import Fall, FoundEffect, error_falls, fall_sentence, fitted_model, found_effects
+from .diagnose import fitted_model, found_effects
+from .diagnosis import Fall, FoundEffect
 from .executor import Executor
+from .falls import error_falls, fall_sentence
 from .features import data_used
 from .prepare import Prepared
 from .search import Progress, Search, silent

@@ -25,10 +25,12 @@ from rich.table import Table
 
 from .add import Addition, add_effects, with_provenance
 from .cache import Store
+from .choose import MAX_EFFECTS
 from .compare import Comparison, MetricRow
 from .compare import compare as compare_model
-from .diagnose import MAX_EFFECTS, Diagnosis, effect_sources
 from .diagnose import diagnose as diagnose_model
+from .diagnose import effect_sources
+from .diagnosis import Diagnosis
 from .executor import Executor, interruptible
 from .experiments import VISIBLE, Experiment
 from .own_effect import check_own_effects

@@ -58,6 +58,12 @@ class Fit:
                 return float(z)
         return None
 
+    @property
+    def off(self) -> list[tuple[Coordinate, float]]:
+        """Nuisance parameters with how many standard deviations of their priors they are off, farthest first."""
+        off = [(c, abs(float(z))) for c, z in zip(self.coordinates, self.z, strict=True) if c.prior]
+        return sorted(off, key=lambda item: -item[1])
+
     def covariance(self, inflate: float = 1.0) -> Array:
         """Covariance (k, k) of z from the curvature at the optimum, with the priors.
 

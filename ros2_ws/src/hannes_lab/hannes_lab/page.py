@@ -26,8 +26,8 @@ import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 
+from .choose import MAX_EFFECTS
 from .cli import _JOBS, Bags, Greedy, Jobs, MaxEffects, ModelFile, Objects, RigFile, Scale, Signals, Topics
-from .diagnose import MAX_EFFECTS
 from .page_guard import Guard, address_of
 from .page_worker import ANSWER, GRACE_S, MODEL, REPORT
 from .prepare import existing

@@ -25,7 +25,8 @@ from hannes_sim.effect import catalogue
 from .add import Addition, add_effects, with_provenance
 from .cli import _after, _check_effects, _executor, _finite, _prepared
 from .compare import compare
-from .diagnose import Diagnosis, diagnose, effect_sources
+from .diagnose import diagnose, effect_sources
+from .diagnosis import Diagnosis
 from .features import data_used
 from .report import verdict_of, write_report
 

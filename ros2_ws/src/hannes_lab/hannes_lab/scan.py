@@ -295,9 +295,7 @@ def _strengths(kind: EffectType) -> dict[str, list[float]]:
 
 def farthest(found: Fit) -> float:
     """How many standard deviations the nuisance parameters are from their nominal values at most."""
-    return max(
-        (abs(float(z)) for c, z in zip(found.coordinates, found.z, strict=True) if c.prior), default=0.0
-    )
+    return found.off[0][1] if found.off else 0.0
 
 
 def point_key(base: Fit) -> bytes:

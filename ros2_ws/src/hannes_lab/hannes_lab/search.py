@@ -368,14 +368,10 @@ class Search:
         """
         tried: set[str] = set()
         while not self.slow:
-            far = [
-                (abs(float(z)), c)
-                for c, z in zip(found.coordinates, found.z, strict=True)
-                if c.prior and not c.wide and "@" not in c.name and c.name not in tried and abs(z) > PULLED
-            ]
-            if not far:
+            far = [c for c, off in found.off if off > PULLED and not c.wide and "@" not in c.name]
+            held = next((c for c in far if c.name not in tried), None)
+            if held is None:
                 break
-            held = max(far, key=lambda item: item[0])[1]
             tried.add(held.name)
             others = [c for c in found.coordinates if c is not held]
             problem = Fixed(self.problem, {held.name: held.value(0.0)})

@@ -1,0 +1,73 @@
+"""Whether a set of effects explains what the model as it is does not, and in what it falls short."""
+
+from __future__ import annotations
+
+from .chance import Chance
+from .search import Candidate, Search
+
+ADEQUATE = 1.25
+"""A set of effects is adequate if its cost is at most this multiple of what chance reaches: room for the linear
+approximation behind the critical value.  Where the model has an error of its own, whose width has room enough, 1."""
+
+OWN_ERROR_MOST = 2.4
+"""Standard deviations of the model's own error that the error of one signal of one condition may reach as a root mean
+square.  A large error in few is lost in the sum over all: then what is left is not the model's form, but something
+that is missing."""
+
+IMPLAUSIBLE = 8.0
+"""Standard deviations of its prior at which a nominal parameter is called far off, and beyond which no set of effects
+that needs it there is adequate: an effect may fit well whose only merit is that it replaces what the model had."""
+
+
+def is_adequate(search: Search, candidate: Candidate, limits: Chance, room: float = ADEQUATE) -> bool:
+    """Whether chance, with the model's own error if it has one, explains what a set leaves."""
+    if apart(search, candidate) or implausible(candidate):
+        return False
+    if search.problem.discrepancy:
+        return candidate.fit.cost <= limits.misfit and worst_error(search, candidate)[1] <= OWN_ERROR_MOST
+    return candidate.fit.cost <= limits.misfit * room
+
+
+def worst_error(search: Search, candidate: Candidate) -> tuple[str, float]:
+    """Where the error is largest in standard deviations of the model's own error; 0 if it has none."""
+    errors = search.problem.own_errors(candidate.fit.residual)
+    block, error = max(errors, key=lambda item: item[1], default=(None, 0.0))
+    return (f"{block.signal} of '{block.condition}'" if block else "", error)
+
+
+def apart(search: Search, candidate: Candidate) -> str:
+    """The parameter of single recordings that differs more between them than it may, in words; empty if none does."""
+    families: dict[str, list[tuple[float, float]]] = {}
+    for nuisance in search.nuisances:
+        family, of_one, _ = nuisance.name.partition("@")
+        z = candidate.fit.z_of(nuisance.name)
+        if of_one and z is not None:
+            families.setdefault(family, []).append((z, nuisance.apart))
+    for family, own in families.items():
+        mean = sum(z for z, _ in own) / len(own)
+        farthest = max(abs(z - mean) for z, _ in own)
+        if any(abs(z - mean) > most for z, most in own):
+            return f"{family} differs between recordings of one machine by {farthest:.0f} times its tolerance"
+    return ""
+
+
+def implausible(candidate: Candidate) -> str:
+    """The well-known parameter that is farther off than IMPLAUSIBLE, in words; empty if none is."""
+    known = candidate.fit.model.parameters
+    c, off = next(((c, z) for c, z in candidate.fit.off if not c.wide and c.name in known), (None, 0.0))
+    if c is None or off <= IMPLAUSIBLE:
+        return ""
+    return (
+        f"{c.name} would be {candidate.fit.values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g}, {off:.0f} times "
+        "its tolerance off: if the nominal model is not that of this machine, calibrate it first"
+    )
+
+
+def shortfall(search: Search, best: Candidate, limits: Chance) -> str:
+    """In what a set that is not adequate falls short."""
+    if best.fit.cost > limits.misfit:
+        return f"misfit {best.fit.cost:.0f} stays above what chance reaches ({limits.misfit:.0f})"
+    if off := apart(search, best) or implausible(best):
+        return off
+    where, error = worst_error(search, best)
+    return f"error in {where} is {error:.1f} times as large as a model of this form is allowed to be off"

@@ -1,0 +1,243 @@
+"""Which set of effects is the answer: the smallest that explains all, or what lowers the held-out error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from hannes_description.errors import HannesError
+
+from .adequacy import is_adequate, shortfall
+from .chance import Chance, chance
+from .diagnosis import Rank
+from .greedy import grow
+from .search import HOPELESS, PENALTY, Candidate, Search
+
+WORTHWHILE = 0.05
+"""A further effect must remove at least this part of the cost, or of the mean square error on held-out conditions."""
+
+OWN_ERROR_PART = 0.12
+"""The same where the model has an error of its own, also within chance: its width is assumed, and it is not noise.
+There a second effect must remove FURTHER times as much."""
+
+TIE = 6.0
+"""Sets whose penalised costs differ by less cannot be told apart: a likelihood ratio of e^3 = 20.  The best is the
+wrong one beyond it in 0.7 % at worst, of sets that are as far apart as that (normal tail at the root of 6)."""
+
+OWN_ERROR_TIE = 12.0
+"""The same where the model has an error of its own."""
+
+RIVAL = 2.0
+"""Sets whose cost is at most so many times that of the best are judged beside it with the noise found at it."""
+
+FURTHER = 1.5
+"""Where all is explained within chance, a further effect must gain so many times what chance gains."""
+
+HALF = 0.5
+"""Effects that were added one after another are the answer where the error on held-out conditions, above the
+repeatability, falls to this part; where more is left, what is missing is something else."""
+
+MAX_EFFECTS = 3
+
+WIDE = (4, 3)
+"""How many of the best singles and pairs are extended by every further effect."""
+
+LEFT_MOST = 0.5
+FAR_OFF = 3.0
+"""Where the best pair leaves more than this part of what the best single effect left above chance, and still so many
+times what chance reaches, triples are not tried: of three effects of the catalogue the second one found explains more
+than the third will."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The set that was chosen, the search (with its noise) in which it was judged, and its rivals of the same size.
+
+    enough   it removes most of the error on held-out conditions, though chance does not explain the rest
+    """
+
+    search: Search
+    best: Candidate
+    limits: Chance
+    adequate: bool
+    ranking: tuple[Rank, ...]
+    rivals: tuple[Candidate, ...] = ()
+    notes: tuple[str, ...] = ()
+    enough: bool = False
+
+
+def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -> Choice:
+    """Smallest adequate set of effects.
+
+    Sets of one, two and three effects in turn; each round extends the best of the round before by every effect, so that
+    two effects of which neither is best alone are found too.  After each round noise, scatter and critical values are
+    estimated afresh at the best point: those of a wrong model are wrong.  Where the misfit is within chance already,
+    only sets that are as good as the best within chance are extended.
+    """
+    choice = Choice(search, null, limits, is_adequate(search, null, limits), ())
+    front, far = [null], list[Candidate]()
+    texts = ("one effect", "two effects", "three effects")
+    for size in range(1, max_effects + 1):
+        enough = is_adequate(choice.search, choice.best, choice.limits, room=1.0)
+        if enough and size > 1:
+            room = choice.limits.misfit - choice.limits.median
+            front = [c for c in front if c.penalised <= front[0].penalised + room]
+        elif size > 1:
+            front += choice.search.refitted(far)
+        needed = needed_gain(choice, choice.best, first=size == 1)
+        worth = choice.best.penalised - 0.5 * needed
+        round_ = _extended(choice.search, front, texts[size - 1], worth)
+        if not round_:
+            break
+        if size == 1 and _hard(choice, round_[0]):
+            again = search.thoroughly().extend(front, list(search.sources), "one effect, thoroughly", worth)
+            round_ = _best_of(round_, again)
+        if enough and round_[0].penalised < worth and set(choice.best.names) < set(round_[0].names):
+            # The set without it may find its way further down from there; what is left is the gain.
+            choice = replace(choice, best=choice.search.without(round_[0], choice.best.names))
+        # What chance gains was found for effects of one free strength; further parameters pay their penalty.
+        gain = choice.best.penalised + PENALTY - round_[0].penalised
+        # Within chance there is nothing to explain, unless an effect gains more than chance does.
+        whole = min(round_[0].fit.cost, limits.median) if gain >= needed else limits.median
+        ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, whole)) for c in round_)
+        if gain < needed:
+            choice = replace(choice, ranking=ranking)
+            break
+        new = choice.search.renewed(round_[0])
+        wide = [
+            c
+            for c in round_[: WIDE[min(size - 1, len(WIDE) - 1)]]
+            if c.penalised <= HOPELESS * round_[0].penalised
+        ]
+        rivals = [c for c in wide if c.penalised <= RIVAL * round_[0].penalised]
+        near = sorted(new.refitted(rivals), key=lambda c: c.penalised)
+        # On a slow plant the refit was one with all derivatives afresh.
+        best = near[0] if new.slow else new.polish(near[0])
+        limits_new = chance(new.problem, best.fit, new.signatures(best))
+        close = tuple(c for c in near[1:] if c.penalised <= best.penalised + tie_width(new))
+        adequate = is_adequate(new, best, limits_new)
+        left = 1.0 - _share(choice.best, round_[0], choice.limits.median)
+        choice = Choice(new, best, limits_new, adequate, ranking, close)
+        if 1 < size < max_effects and left > LEFT_MOST and best.fit.cost > FAR_OFF * limits_new.misfit:
+            choice = replace(choice, notes=(_ended_early(size, left, best, limits_new),))
+            break
+        front, far = [best, *near[1:]], [c for c in wide if c not in rivals]
+    return pruned(choice)
+
+
+def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects: int) -> Choice:
+    """Effects one after another while the mean square error on held-out conditions falls by at least WORTHWHILE."""
+    if len(search.problem.features.conditions) < 2:
+        raise HannesError(
+            "--greedy judges by conditions that took no part in the fit, and there is one condition only: record "
+            "another speed or load, or leave --greedy out."
+        )
+    grown = grow(search, null, max_effects, WORTHWHILE)
+    adequate = is_adequate(search, grown.best, limits)
+    ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits.median)) for c in grown.first)
+    notes = list(grown.notes)
+    first, last = grown.errors[0], grown.errors[-1]
+    enough = bool(grown.best.names) and last - 1.0 <= HALF * (first - 1.0)
+    if enough and not adequate:
+        notes.append(
+            f"the {shortfall(search, grown.best, limits)}: something smaller is left that the "
+            "catalogue does not explain"
+        )
+    elif grown.best.names and not adequate:
+        notes.append(
+            f"what was added lowers the error on held-out conditions from {first:.3g} to {last:.3g} times the "
+            "repeatability; less than half would be an answer"
+        )
+    return Choice(search, grown.best, limits, adequate, ranking, grown.rivals, tuple(notes), enough)
+
+
+def _hard(choice: Choice, first: Candidate) -> bool:
+    """Whether effects must be tried thoroughly: the model as it is went far off, and no effect explains enough.
+
+    Where the model has an error of its own, much is explained by what is wrong: then always, unless nothing is missing.
+    """
+    if choice.search.slow or not choice.best.pulled or choice.adequate:
+        return False
+    return bool(choice.search.problem.discrepancy) or not is_adequate(choice.search, first, choice.limits)
+
+
+def _ended_early(size: int, left: float, best: Candidate, limits: Chance) -> str:
+    return (
+        f"the best {size} effects leave {100 * left:.0f} % of the misfit that {size - 1} left, and "
+        f"{best.fit.cost / limits.misfit:.0f} times what chance reaches: sets of more effects were not tried"
+    )
+
+
+def tie_width(search: Search) -> float:
+    """By how much the penalised costs of sets that tie may differ."""
+    return OWN_ERROR_TIE if search.problem.discrepancy else TIE
+
+
+def needed_gain(choice: Choice, base: Candidate, *, first: bool = False) -> float:
+    """By how much a further effect must lower the penalised cost of a base; `first`: it is the first of the search."""
+    limits = choice.limits
+    enough = is_adequate(choice.search, base, limits, room=1.0)
+    part = OWN_ERROR_PART if choice.search.problem.discrepancy else 0.0 if enough else WORTHWHILE
+    return max(limits.gain, part * base.fit.cost) * (FURTHER if enough and not first else 1.0)
+
+
+def pruned(choice: Choice) -> Choice:
+    """Without what a later effect made superfluous: sets grow one by one, and an early one may be a stopgap."""
+    while choice.adequate and len(choice.best.names) > 1:
+        best = choice.best
+        parts = [
+            choice.search.without(best, tuple(n for n in best.names if n != name)) for name in best.names
+        ]
+        part = min(parts, key=lambda c: c.penalised)
+        gain = part.penalised + PENALTY - best.penalised
+        if gain >= needed_gain(choice, part) or not is_adequate(choice.search, part, choice.limits):
+            break
+        alike = [
+            c
+            for names, c in choice.search.found.items()
+            if len(names) == len(part.names)
+            and set(names) != set(part.names)
+            and c.penalised <= part.penalised + tie_width(choice.search)
+            and is_adequate(choice.search, c, choice.limits)
+        ]
+        choice = replace(choice, best=part, rivals=tuple(alike))
+    return choice
+
+
+def _extended(search: Search, front: Sequence[Candidate], text: str, worth: float) -> list[Candidate]:
+    """The front with one further effect each, best first.
+
+    Where the best set holds a smaller one that was not extended, that is extended too: the other effect of a pair may
+    be the right one though it was not among the best alone.
+    """
+    names = list(search.sources)
+    round_ = search.extend(front, names, text, worth)
+    extended = {frozenset(c.names) for c in front}
+    while round_ and round_[0].penalised < worth and len(round_[0].names) > 1:
+        parts = [frozenset(n for n in round_[0].names if n != one) for one in round_[0].names]
+        left = [p for p in parts if p not in extended]
+        if not left:
+            break
+        bases = [search.fitted(tuple(sorted(p))) for p in left]
+        extended |= set(left)
+        better = search.extend(bases, names, f"{text}, exchanged", round_[0].penalised)
+        round_ = _best_of(round_, better)
+    return round_
+
+
+def _best_of(some: Sequence[Candidate], others: Sequence[Candidate]) -> list[Candidate]:
+    """Each set once, as it was fitted best; best first."""
+    sets = {frozenset(c.names): c for c in sorted((*some, *others), key=lambda c: -c.penalised)}
+    return sorted(sets.values(), key=lambda c: c.penalised)
+
+
+def _share(base: Candidate, candidate: Candidate, least: float) -> float:
+    """Part of the base's misfit above a complete model's that the candidate removes, 0..1."""
+    excess = base.fit.cost - least
+    return float(np.clip((base.fit.cost - candidate.fit.cost) / excess, 0.0, 1.0)) if excess > 0 else 0.0
+
+
+def tied_sets(choice: Choice) -> tuple[tuple[str, ...], ...]:
+    """Sets of the same size that fit as well as the best, within what chance can gain; the best comes first."""
+    return (choice.best.names, *(c.names for c in sorted(choice.rivals, key=lambda c: c.penalised)))

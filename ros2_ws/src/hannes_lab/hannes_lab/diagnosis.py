@@ -1,0 +1,145 @@
+"""What a diagnosis says: the answer as --json, the report and the page show it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from hannes_description.model import Model
+
+from .chance import Chance
+from .depends import Dependence
+from .errors import (
+    SignalError,
+)
+from .experiments import Experiment
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """Value and 95 % interval.
+
+    Identified is False where the value lies on its bound or the interval spans the range.
+    """
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    identified: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        return self.__dict__.copy()
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """An effect of the verdict, with its parameters."""
+
+    name: str
+    title: str
+    source: str | None
+    parameters: Mapping[str, ParameterEstimate]
+    why: str
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "title": self.title,
+            "source": self.source,
+            "why": self.why,
+            "parameters": {n: p.to_dict() for n, p in self.parameters.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Fall:
+    """One step of the error's fall, in multiples of the repeatability.
+
+    train, held_out   fitted on every second closure, judged on the others
+    by_condition      error on each condition when it took no part in the fit
+    held_out_conditions  one number for them all (errors.condition_error); with `--greedy` it decides
+    held_out_signals  the same per signal, root mean square over the conditions in the signal's unit
+    """
+
+    added: str
+    train: float
+    held_out: float
+    by_condition: Mapping[str, float]
+    signals: tuple[SignalError, ...]
+    held_out_signals: Mapping[str, float] = field(default_factory=dict)
+    held_out_conditions: float = math.nan
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "added": self.added,
+            "train": self.train,
+            "held_out": self.held_out,
+            "by_condition": dict(self.by_condition),
+            "signals": [s.to_dict() for s in self.signals],
+            "held_out_signals": dict(self.held_out_signals),
+            "held_out_conditions": self.held_out_conditions,
+        }
+
+
+@dataclass(frozen=True)
+class Rank:
+    """One row of the ranking: the cost of the model with this effect (set) added, after a full refit."""
+
+    names: tuple[str, ...]
+    cost: float
+    explained: float
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"names": list(self.names), "cost": self.cost, "explained": self.explained}
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The answer; `to_dict` is what --json, the report and the page show."""
+
+    verdict: str
+    summary: str
+    effects: tuple[FoundEffect, ...]
+    tied: tuple[tuple[str, ...], ...]
+    experiments: tuple[Experiment, ...]
+    falls: tuple[Fall, ...]
+    ranking: tuple[Rank, ...]
+    depends_on: tuple[Dependence, ...]
+    chance: Chance
+    costs: Mapping[str, float]
+    nuisances: Mapping[str, Mapping[str, Any]]
+    notes: tuple[str, ...]
+    simulations: int
+    data: tuple[Mapping[str, Any], ...]
+    model: Model
+    values: Mapping[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        falls = self.falls
+        return {
+            "verdict": self.verdict,
+            "summary": self.summary,
+            "effects": [e.to_dict() for e in self.effects],
+            "tied": [list(names) for names in self.tied],
+            "experiments": [e.to_dict() for e in self.experiments],
+            "error": {
+                "nominal": falls[0].held_out,
+                "final": falls[-1].held_out,
+                "repeatability": 1.0,
+                "held_out": True,
+                "unit": "multiples of the repeatability between closures",
+            },
+            "falls": [f.to_dict() for f in falls],
+            "ranking": [r.to_dict() for r in self.ranking],
+            "depends_on": {d.variable: d.to_dict() for d in self.depends_on},
+            "chance": self.chance.__dict__.copy(),
+            "costs": dict(self.costs),
+            "nuisances": {n: dict(v) for n, v in self.nuisances.items()},
+            "notes": list(self.notes),
+            "simulations": self.simulations,
+            "data": [dict(d) for d in self.data],
+            "model": {"name": self.model.name, "sha256": self.model.sha256},
+        }

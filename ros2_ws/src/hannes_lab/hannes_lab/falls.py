@@ -1,0 +1,115 @@
+"""How the error on closures that took no part in the fit falls, effect by effect."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .diagnosis import Fall
+from .errors import (
+    condition_error,
+    held_out_closures,
+    held_out_condition_errors,
+    overall,
+    per_signal,
+    signal_errors,
+)
+from .features import Features
+from .prepare import Prepared
+from .problem import Problem, build_problem
+from .rig import Rig
+from .search import Candidate, Search
+from .settle import slopes_at
+from .surrogate import exact_rig
+
+NO_REPEATS = "There is one closure of each condition only: nothing could be held out, and the repeatability is a guess."
+
+
+def error_falls(
+    prepared: Prepared, search: Search, best: Candidate, *, in_order: bool = False
+) -> tuple[Fall, ...]:
+    """Nominal as given, nominal fitted, then the effects one after another in the order that helps most.
+
+    in_order   take the effects in the order in which they stand
+    """
+    features = prepared.features
+    nominal = signal_errors(features, features.closures(prepared.rig, prepared.model, {}))
+    falls = [
+        Fall(
+            "nominal, as given",
+            overall(nominal),
+            overall(nominal),
+            {c: overall([e for e in nominal if e.condition == c]) for c in features.conditions},
+            nominal,
+            per_signal(features, [nominal]),
+            condition_error(features, [nominal]),
+        )
+    ]
+    steps: list[tuple[str, Candidate]] = [("nominal, fitted", search.null())]
+    chain: tuple[str, ...] = ()
+    left = list(best.names)
+    while left:
+        options = [
+            search.found.get(tuple(sorted((*chain, name))))
+            or search.add(search.found[tuple(sorted(chain))], name)
+            for name in (left[:1] if in_order else left)
+        ]
+        pick = min(range(len(options)), key=lambda k: options[k].penalised)
+        chain = (*chain, left[pick])
+        steps.append((left.pop(pick), options[pick]))
+    held = search.each(_fall_in_worker, [(c, best.fit.values) for _, c in steps], "held-out error")
+    for (label, _), found in zip(steps, held, strict=True):
+        falls.append(Fall(label, *found))
+    return tuple(falls)
+
+
+def _fall_in_worker(search: Search, candidate: Candidate, values: Mapping[str, float]) -> tuple[Any, ...]:
+    """What a Fall holds of one fitted set; the noise is estimated at `values`."""
+    f = candidate.fit
+    features = search.problem.features
+    problem = search.problem.with_rig(slopes_at(search.problem.rig, f))
+    build = _problem_builder(search, problem.rig, values)
+    train, test = held_out_closures(build, features, f.model, f.coordinates, f.z)
+    held = held_out_condition_errors(problem, f.model, f.coordinates, f.z)
+    by_condition = {condition: overall(own) for condition, own in held.items()}
+    errors = signal_errors(features, features.closures(exact_rig(problem.rig), f.model, f.values))
+    of_all = condition_error(features, held.values())
+    return train, test, by_condition, errors, per_signal(features, held.values()), of_all
+
+
+def _problem_builder(search: Search, rig: Rig, values: Mapping[str, float]) -> Any:
+    """A function from Features to a Problem with noise estimated on those features."""
+
+    def build(features: Features) -> Problem:
+        nuisances = search.nuisances
+        values_there = {n.name: values.get(n.name, n.mean) for n in nuisances}
+        return build_problem(rig, features, search.model, nuisances, values_there)
+
+    return build
+
+
+def worth_showing(
+    search: Search, best: Candidate, falls: tuple[Fall, ...]
+) -> tuple[Candidate, tuple[Fall, ...]]:
+    """Where something unknown is left, only those effects that lower the error on held-out closures are shown."""
+    errors = [fall.held_out for fall in falls[1:]]
+    if not np.isfinite(errors).any():
+        return best, falls
+    keep = 1 + int(np.nanargmin(errors))
+    names = tuple(fall.added for fall in falls[2 : keep + 1])
+    if len(names) == len(best.names):
+        return best, falls
+    return search.found[tuple(sorted(names))], falls[: keep + 1]
+
+
+def fall_sentence(falls: Sequence[Fall]) -> str:
+    """How the error on held-out closures falls; says so where there is one closure only."""
+    before, after = falls[1].held_out, falls[-1].held_out
+    if not np.isfinite([before, after]).all():
+        return NO_REPEATS
+    return (
+        f"The error on held-out closures falls from {before:.2f} (nominal, fitted) to {after:.2f} times the "
+        "repeatability."
+    )

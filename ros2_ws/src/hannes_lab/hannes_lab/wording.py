@@ -1,0 +1,184 @@
+"""The answer in words: its summary, and the notes beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .adequacy import shortfall
+from .chance import Chance
+from .choose import Choice, needed_gain
+from .diagnosis import Fall, FoundEffect
+from .experiments import VISIBLE, Experiment
+from .falls import NO_REPEATS, fall_sentence
+from .fit import Fit
+from .problem import Coordinate, Problem
+from .search import PENALTY, Candidate, Search
+
+ANY_DIFFERENCE = (
+    "a difference of any size counts here that chance does not explain; no simple model of a real machine is that "
+    "exact: --greedy adds effects for as long as the error on conditions that were left out of the fit falls"
+)
+
+MANY_FAILURES = 0.05
+"""Part of the simulations that did not stay finite from which on their parameters are worth a look."""
+
+FAR = 3.0
+"""Standard deviations of its prior at which a parameter of the nominal model is called far off."""
+
+
+def summary(
+    search: Search,
+    verdict: str,
+    effects: Sequence[FoundEffect],
+    tied: Sequence[Sequence[str]],
+    falls: Sequence[Fall],
+    limits: Chance,
+    best: Candidate,
+    nearest: str,
+) -> str:
+    """The verdict in a sentence or two: what is missing, how the error falls, and what to be careful with."""
+    fall = fall_sentence(falls)
+    far = _moved_far(best)
+    if verdict == "nothing":
+        return (
+            f"Nothing is missing: with its own parameters fitted, the model's misfit {best.fit.cost:.0f} is below what "
+            f"chance reaches ({limits.misfit:.0f}), and no effect of the catalogue gains more than chance would. "
+            + (
+                f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability."
+                if np.isfinite(falls[-1].held_out)
+                else NO_REPEATS
+            )
+            + (far and far + nearest)
+        )
+    names = " and ".join(e.title for e in effects)
+    if verdict == "effects":
+        tie = ""
+        if len(tied) > 1:
+            others = "; ".join(" + ".join(names_) for names_ in tied[1:])
+            tie = f" With these data it ties with: {others}."
+        return f"Missing: {names}. {fall}{tie}{far}"
+    part = f" The catalogue comes nearest with {names}, which is not enough." if names else ""
+    why = shortfall(search, best, limits)
+    return f"Something is missing that is not in the catalogue: the best model's {why}.{part} {fall}"
+
+
+def notes(
+    search: Search, best: Candidate, verdict: str, experiments: Sequence[Experiment], greedy: bool
+) -> tuple[str, ...]:
+    """What else a user must know of an answer, a sentence each."""
+    return (
+        *_any_difference(search, verdict, greedy),
+        *_inseparable(search, experiments),
+        *_ends(best),
+        *_undescribed(best),
+        *_identifiability(best),
+        *failure_notes(search.problem),
+    )
+
+
+def nearest_sentence(choice: Choice) -> str:
+    """A sentence on the effect that would gain most where nothing is missing, and on what it would have to gain."""
+    if choice.best.names or not choice.ranking:
+        return ""
+    first = choice.ranking[0]
+    gain = choice.best.penalised + PENALTY - first.cost
+    asked = needed_gain(choice, choice.best, first=True)
+    return (
+        f" The effect that comes nearest is {' + '.join(first.names)}: it lowers the misfit by {max(gain, 0.0):.0f}, "
+        f"and {asked:.0f} are asked for."
+    )
+
+
+def _moved_far(best: Candidate) -> str:
+    """A sentence on nominal parameters far from their values: this machine's, or an effect of the same form."""
+    far = [
+        f"{c.name} {best.fit.values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g}"
+        for c, off in best.fit.off
+        if off > FAR
+    ]
+    if not far:
+        return ""
+    return (
+        f" But it takes {', '.join(far)}, far outside the tolerance: is the nominal model that of this machine, or is "
+        "there an effect of the same form?"
+    )
+
+
+def failure_notes(problem: Problem) -> list[str]:
+    """How many simulations did not stay finite, and whether that matters; a fit takes them for very bad."""
+    if not problem.failures:
+        return []
+    few = problem.failures < MANY_FAILURES * problem.simulations
+    meaning = (
+        "harmless: values that the search tried and left"
+        if few
+        else f"above {100 * MANY_FAILURES:.0f} % the search may have missed the best values: look at the model's "
+        "parameters and at effects of your own"
+    )
+    return [
+        f"{problem.failures} of {problem.simulations} simulations did not stay finite and counted as very bad fits "
+        f"({meaning})"
+    ]
+
+
+def _any_difference(search: Search, verdict: str, greedy: bool) -> list[str]:
+    """What else can be tried where chance does not explain what is left, and the model may be off by nothing."""
+    problem = search.problem
+    may = verdict == "unknown" and not greedy and not problem.discrepancy
+    return [ANY_DIFFERENCE] if may and len(problem.features.conditions) > 1 else []
+
+
+def _inseparable(search: Search, experiments: Sequence[Experiment]) -> list[str]:
+    """What shows each of the tied effects, where no experiment that was considered tells them apart."""
+    if not experiments or experiments[0].distance >= VISIBLE:
+        return []
+    names = dict.fromkeys(name for tied in experiments[0].separates for name in tied)
+    shown = "; ".join(f"{name} by: {search.effect(name).told_by or '(not said)'}" for name in names)
+    return [
+        f"no further recording that was considered tells {', '.join(' + '.join(t) for t in experiments[0].separates)} "
+        f"apart (they differ by {experiments[0].distance:.1f} standard deviations of the noise at most); what shows "
+        f"each: {shown}"
+    ]
+
+
+def at_end_of_range(found: Fit) -> list[Coordinate]:
+    """The effects' parameters that would go beyond their range."""
+    return [c for c, z in zip(found.coordinates, found.z, strict=True) if not c.prior and c.at_end(float(z))]
+
+
+def _ends(best: Candidate) -> list[str]:
+    """The effects' parameters that the end of their range holds."""
+    return [
+        f"{c.name} lies at the end of its range ({c.lower:g} to {c.upper:g} {c.unit}): the true value may lie beyond "
+        "it, or it is another effect of a similar form"
+        for c in at_end_of_range(best.fit)
+    ]
+
+
+def _undescribed(best: Candidate) -> list[str]:
+    """What the recordings do not say of the machine as a whole, as it was fitted."""
+    fitted = [
+        f"{c.name} {c.value(float(z)):.3g} {c.unit}".rstrip()
+        for c, z in zip(best.fit.coordinates, best.fit.z, strict=True)
+        if c.wide and "@" not in c.name
+    ]
+    return [f"the recordings do not tell these, so they were fitted: {', '.join(fitted)}"] if fitted else []
+
+
+def _identifiability(best: Candidate) -> list[str]:
+    """What this data cannot tell: pairs of effect and nuisance parameters that move the data alike."""
+    covariance = best.fit.covariance()
+    sd = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(sd, sd)
+    notes = []
+    for i, a in enumerate(best.fit.coordinates):
+        for j in range(i):
+            b = best.fit.coordinates[j]
+            if not (a.prior and b.prior) and abs(correlation[i, j]) > 0.97:
+                notes.append(
+                    f"{a.name} and {b.name} cannot be told apart well with these data "
+                    f"(correlation {correlation[i, j]:+.3f})"
+                )
+    return notes
