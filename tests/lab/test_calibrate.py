@@ -10,20 +10,13 @@ import numpy as np
 import pytest
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
-from hannes_lab.calibrate import (
-    Remembered,
-    Target,
-    TargetProblem,
-    _key,
-    calibrate,
-    calibrate_targets,
-    free_coordinates,
-    identify,
-    search,
-)
+from hannes_lab.calibrate import _key, calibrate
 from hannes_lab.hide import make_set
+from hannes_lab.identify import free_coordinates, identify, search
 from hannes_lab.prepare import prepare
+from hannes_lab.remembered import Remembered
 from hannes_lab.trials import make_trial, unique_names
+from hannes_lab.validation.targets import Target, TargetProblem, calibrate_targets
 
 NOMINAL = Model.load("nominal")
 NAMES = ["friction.coulomb", "hand.preload"]

@@ -17,9 +17,9 @@ from hannes_description.parameters import data_path
 from rich.console import Console
 from rich.table import Table
 
-from ..calibrate import default_cache
 from ..cli import _finite, _Progress
 from ..executor import interruptible
+from ..remembered import default_cache
 from . import (
     columns,
     convergence,

@@ -22,10 +22,12 @@ from hannes_sim.effect import load_effect
 from hannes_sim.objects import RIGID_DYNAMOMETER, SOFT_BALL
 from scipy.optimize import minimize_scalar
 
-from ..calibrate import Calibration, Progress, Target, TargetProblem, calibrate_targets
+from ..identify import Calibration
 from ..problem import Coordinate
+from ..search import Progress
 from . import least_force
 from .currents import closure_time, figures, simulate
+from .targets import Target, TargetProblem, calibrate_targets
 
 REAL = {
     "rigid": {

@@ -18,7 +18,7 @@ from hannes_description.model import Model
 from hannes_description.parameters import read_yaml
 from hannes_sim.objects import RIGID_DYNAMOMETER, SOFT_BALL
 
-from ..calibrate import Progress
+from ..search import Progress
 from . import fitting
 from .currents import figures, simulate
 
