@@ -117,7 +117,7 @@ class DoublePIDParameters:
         )
 
     def to_array(self) -> NDArray[np.float64]:
-        return np.array(list(asdict(self).values()), dtype=np.float64)
+        return np.array([getattr(self, item.name) for item in fields(self)], dtype=np.float64)
 
 
 def control(x: Any, p: Any, s: Any) -> float:

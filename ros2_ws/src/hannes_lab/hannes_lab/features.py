@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,13 @@ MOST_SHIFT = 15
 def alike(closures: Array) -> Array:
     """Closures (n, p) without the first of four or more, which starts from another state than the others."""
     return closures[1:] if closures.shape[0] >= 4 else closures
+
+
+@cache
+def _mean_and_drift(n: int) -> Array:
+    """(2, n): what makes of n closures their mean and their change from the first to the last."""
+    ramp = np.linspace(-0.5, 0.5, n)
+    return np.stack([np.full(n, 1.0 / n), ramp / (ramp @ ramp)])
 
 
 @dataclass(frozen=True)
@@ -93,11 +101,9 @@ class Block:
 
     def combine(self, closures: Array) -> Array:
         """Features (size,) of closures (n, p): the mean, then the change from the first to the last (linear trend)."""
-        mean = closures.mean(axis=0)
         if self.n < MIN_CLOSURES_FOR_DRIFT:
-            return mean
-        ramp = np.linspace(-0.5, 0.5, self.n)
-        return np.concatenate([mean, ramp @ (closures - mean) / (ramp @ ramp)])
+            return np.asarray(closures.mean(axis=0))
+        return (_mean_and_drift(self.n) @ closures).ravel()
 
     def predicted(self, ticks: Array, compact: bool) -> Array:
         """Closures (n, p) from a simulated signal on the control grid."""

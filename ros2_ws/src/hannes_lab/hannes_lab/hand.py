@@ -18,6 +18,7 @@ from hannes_sim.measurement import Sensors, folded_mean, logger, sample_noise
 from hannes_sim.objects import GraspObject, named_object
 from hannes_sim.plant import Plant
 from hannes_sim.rollout import Rollout, step_of
+from numba import njit
 from numpy.typing import NDArray
 
 from .features import FINEST, Block
@@ -274,7 +275,7 @@ class HandRig(PlantRig):
         sd = np.full(block.phase.size, OWN_ERROR.get(block.signal, OWN_ERROR_DRIVE) * span)
         closure = trial.of(block.condition)[0]
         at = closure.start + block.phase
-        near = RESTING * float(np.ptp(trial.reference))
+        near = RESTING * trial.span
         rest = float(np.median(trial.reference[[0, -1]]))
         ticks = np.arange(trial.reference.size) * trial.period
         resting = np.abs(np.interp(at, ticks, trial.reference) - rest) < near
@@ -421,16 +422,45 @@ def _moved(reference: Array, delay: float, lead: float, trial: Trial) -> Array:
         return reference
     n = reference.size
     whole = trial.reference if np.array_equal(trial.reference[:n], reference) else reference
-    ticks = np.arange(whole.size, dtype=np.float64)
     if lead != 0.0:
         whole = whole + lead * np.gradient(_moving_mean(whole, _RATE_OVER / trial.period), trial.period)
-    return np.interp(ticks[:n] - delay / trial.period, ticks, whole)
+    moved: Array = _later(np.ascontiguousarray(whole), delay / trial.period, n)
+    return moved
+
+
+@njit(cache=True, nogil=True)
+def _at_tick(values, at):  # type: ignore[no-untyped-def]
+    """Linear interpolation of values (n,) at a place in ticks; beyond the ends, the end."""
+    if at <= 0.0:
+        return values[0]
+    if at >= values.size - 1:
+        return values[-1]
+    k = int(at)
+    return values[k] + (at - k) * (values[k + 1] - values[k])
+
+
+@njit(cache=True, nogil=True)
+def _later(values, ticks, n):  # type: ignore[no-untyped-def]
+    """The first n values, later by `ticks`."""
+    out = np.empty(n)
+    for k in range(n):
+        out[k] = _at_tick(values, k - ticks)
+    return out
 
 
 def _moving_mean(values: Array, width: float) -> Array:
     """Mean over the trailing `width` ticks; unlike `logger`, continuous in the width."""
-    ticks = np.arange(values.size + 1, dtype=np.float64)
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    end = ticks[1:]
-    begin = np.maximum(end - max(width, 1.0), 0.0)
-    return (total[1:] - np.interp(begin, ticks, total)) / (end - begin)
+    mean: Array = _trailing_mean(np.ascontiguousarray(values), max(width, 1.0))
+    return mean
+
+
+@njit(cache=True, nogil=True)
+def _trailing_mean(values, width):  # type: ignore[no-untyped-def]
+    total = np.zeros(values.size + 1)
+    for k in range(values.size):
+        total[k + 1] = total[k] + values[k]
+    out = np.empty(values.size)
+    for k in range(values.size):
+        begin = max(k + 1 - width, 0.0)
+        out[k] = (total[k + 1] - _at_tick(total, begin)) / (k + 1 - begin)
+    return out

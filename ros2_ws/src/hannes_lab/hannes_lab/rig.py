@@ -345,7 +345,7 @@ def _came_back(run: Rollout, trial: Trial) -> bool:
     if len(ends) < 2 or ends[1] >= run.raw.shape[0]:
         return True
     here, there = run.raw[ends[0], [R_Q, R_QL]], run.raw[ends[1], [R_Q, R_QL]]
-    return bool(np.abs(here - there).max() <= COMES_BACK * np.ptp(trial.reference))
+    return bool(np.abs(here - there).max() <= COMES_BACK * trial.span)
 
 
 def _wanted(model: Model, values: Mapping[str, float], trial: Trial) -> dict[str, float]:

@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -115,6 +116,11 @@ class Trial:
                 f"Trial '{self.name}': no closure was found: the reference never leaves its rest value "
                 "and comes back. Record at least one whole closure."
             )
+
+    @cached_property
+    def span(self) -> float:
+        """How far the reference goes, in its unit."""
+        return float(np.ptp(self.reference))
 
     def unit(self, signal: str) -> str:
         return self.units.get(signal, UNITS.get(signal, ""))

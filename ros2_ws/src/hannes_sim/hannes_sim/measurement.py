@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 from hannes_description.errors import HannesError
+from numba import njit
 from numpy.typing import NDArray
-from scipy.special import erf
 
 from .rollout import Rollout
 
@@ -134,12 +134,23 @@ def folded_mean(current: Array, noise: float) -> Array:
     The folded normal distribution (Leone, Nelson, Nottingham 1961); near zero current a rectified log never averages to
     zero.
     """
-    out = np.abs(current)
     if noise <= 0.0:
-        return out
-    near = np.flatnonzero(out < FOLDED * noise)
-    u = current[near] / noise
-    out[near] = noise * (math.sqrt(2.0 / math.pi) * np.exp(-0.5 * u * u) + u * erf(u / math.sqrt(2.0)))
+        return np.abs(current)
+    folded: Array = _folded(np.ascontiguousarray(current), float(noise))
+    return folded
+
+
+@njit(cache=True, nogil=True)
+def _folded(current, noise):  # type: ignore[no-untyped-def]
+    out = np.empty(current.size)
+    for k in range(current.size):
+        value = abs(current[k])
+        if value < FOLDED * noise:
+            u = value / noise
+            value = noise * (
+                math.sqrt(2.0 / math.pi) * math.exp(-0.5 * u * u) + u * math.erf(u / math.sqrt(2.0))
+            )
+        out[k] = value
     return out
 
 
