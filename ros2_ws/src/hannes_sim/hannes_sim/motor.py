@@ -43,8 +43,10 @@ from .ports import (
     RESISTANCE,
     RESISTANCE_REL,
     S_CURRENT,
+    S_DECAY,
     S_DELAY_INDEX,
     S_POSITION_READ,
+    S_RATE,
     S_TIME_STEPS,
     SENSE_CURRENT,
     SENSE_CURRENT_GAIN,
@@ -120,7 +122,10 @@ def motor_torque(handle):  # type: ignore[no-untyped-def]
     final = drive / resistance
     before = s[S_CURRENT]
     rate = resistance / p[P_INDUCTANCE] * p[P_DT] if p[P_INDUCTANCE] > 0.0 else math.inf
-    decay = math.exp(-rate)
+    if rate != s[S_RATE]:
+        s[S_RATE] = rate
+        s[S_DECAY] = math.exp(-rate)
+    decay = s[S_DECAY]
     if y[BRUSH] > 0.0:
         held = drive + decay * resistance / (1.0 - decay) * before
         final = (

@@ -91,6 +91,10 @@ S_LOAD = 2  # N.m of the last step
 S_CONTACT = 3  # N.m of the last step
 S_POSITION_READ = 4  # rad, last encoder reading
 S_DELAY_INDEX = 5  # write position in the ring of commands
-N_STATE_COMMON = 6
+S_RATE = (
+    6  # dt over the electrical time constant of the last step, and exp(-it): of the few things that cost time
+)
+S_DECAY = 7
+N_STATE_COMMON = 8
 
 DELAY_RING = 512  # commands kept; the longest delay is DELAY_RING x dt
