@@ -157,6 +157,25 @@ def test_a_quick_start_is_no_part_of_the_grasp() -> None:
     assert place == pytest.approx(7.2, abs=0.5) and stiffness == pytest.approx(0.21 * 0.32 / 4.5, rel=0.1)
 
 
+def test_the_crest_of_a_ripple_is_no_object() -> None:
+    """Beside a closure that brakes and so needs little, a ripple of the drive stands out at the end of the way."""
+    q = np.linspace(2.5, 12.5, 200)
+    slow = 0.22 + 0.003 * q + 0.05 * np.sin(19.0 * q)
+    braking = np.interp(q, [2.5, 4.0, 12.5], [0.38, 0.16, 0.12])
+    nominal = (0.02, 0.001, 0.21)
+    assert _seen((q, slow), [(q, braking)], nominal) is None
+    seen = _seen((q, slow + 0.08 * np.maximum(q - 8.0, 0.0)), [(q, braking), (q, slow)], nominal)
+    assert seen is not None and seen[0] == pytest.approx(0.21 * 0.08, rel=0.5) and 7.0 < seen[1] < 9.5
+
+
+def test_a_free_hand_takes_about_what_the_nominal_one_does() -> None:
+    """A quick closure that brakes for most of its way says little of what moves a slow one."""
+    q = np.linspace(2.5, 12.5, 200)
+    slow = 0.17 + 0.03 * np.maximum(q - 8.0, 0.0)
+    braking = np.interp(q, [2.5, 5.0, 12.5], [0.57, 0.12, 0.10])
+    assert _seen((q, slow), [(q, braking)], (0.035, 0.0015, 0.21)) is None
+
+
 def closing(name: str, position: list[tuple[float, float]], current: list[tuple[float, float]]) -> Trial:
     """A recording of one closure: position by time, current by time."""
     time = np.arange(0.0, 4.0, 0.01)

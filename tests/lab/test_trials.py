@@ -84,6 +84,21 @@ def test_a_slow_log_of_the_reference_is_filled_smoothly(rate: float) -> None:
     assert np.sqrt((error**2).mean()) < 0.5 * np.sqrt((linear**2).mean())
 
 
+@pytest.mark.parametrize("rate", [50.0, 200.0])
+def test_of_messages_of_one_instant_the_last_holds(rate: float) -> None:
+    """A recorder that stamps what it receives may give two messages that came together the same stamp."""
+    at = np.arange(0.0, 1.0, 1.0 / rate)
+    values = np.minimum(at, 1.0 - at)
+    twice = np.sort(np.concatenate([at, at[20:23]]))
+    last = np.searchsorted(twice, at, side="right") - 1
+    given = np.full(twice.size, 0.7)
+    given[last] = values
+    for hold_rate in (10.0, 1e4):
+        doubled, _ = reference_on_grid(twice, given, 1e-3, 0.9, hold_rate)
+        single, _ = reference_on_grid(at, values, 1e-3, 0.9, hold_rate)
+        assert np.array_equal(doubled, single)
+
+
 def test_a_fast_log_is_held_as_the_controller_does() -> None:
     at = np.arange(0.0, 1.0, 0.01)
     filled, note = reference_on_grid(at, np.arange(100.0), 1e-3, 0.999)

@@ -31,11 +31,20 @@ EXCESS_OVER_NOMINAL = 2.0
 """An object is seen where the current exceeds this multiple of what moves the free hand at the same place, by this much
 (A).  The nominal hand's current is less to be trusted than that of another recording of the same hand."""
 
+LEAST_FREE = 0.8
+"""Part of the nominal hand's current that a free hand takes at least, whatever another recording shows that brakes."""
+
+RIPPLE_OVER = 0.1
+"""Part of the way over which the current's own trend is taken: what comes and goes within it is a ripple, no object."""
+
 STANDS = 1e-3
 """Part of the way that counts as one place."""
 
 STIFFER = 3.0
 """An object is stiffer than this multiple of the hand's own springs."""
+
+PLACES = 200
+"""How many places along the way a curve is looked at for its ripple."""
 
 RISE = (0.3, 0.8)
 """Parts of the excess between which its slope is taken."""
@@ -164,7 +173,8 @@ def _seen(
         there = np.maximum(np.interp(q, *other), np.median(other[1]))
         if factor > EXCESS[0] or there[peak] < base[peak]:
             factor, base = EXCESS[0], there
-    if current[peak] < factor * base[peak] + EXCESS[1]:
+    least = max(base[peak], LEAST_FREE * free[peak])
+    if current[peak] - _ripple(q[: peak + 1], current[: peak + 1]) < factor * least + EXCESS[1]:
         return None
     excess = (current - base)[: peak + 1]
     # From the peak backwards: what a quick start takes more than a slow one is no object.
@@ -174,6 +184,18 @@ def _seen(
     if slope * per_ampere < STIFFER * rate or place < FREE_TRAVEL * q[-1]:
         return None
     return float(np.clip(slope * per_ampere, 1e-3, 5.0)), max(place, 0.0)
+
+
+def _ripple(q: Array, current: Array) -> float:
+    """Amplitude of what comes and goes with the position.
+
+    Half of the places decide, so that a rise at the end does not: of a sine's absolute values the median is 0.71 of its
+    amplitude.
+    """
+    width = round(0.5 * RIPPLE_OVER * PLACES)
+    even = np.interp(np.linspace(q[0], q[-1], PLACES), q, current)
+    trend = np.convolve(even, np.full(2 * width + 1, 1.0 / (2 * width + 1)), mode="valid")
+    return math.sqrt(2.0) * float(np.median(np.abs(even[width:-width] - trend)))
 
 
 def _last_rise(q: Array, excess: Array, level: float) -> tuple[float, float]:

@@ -166,7 +166,10 @@ def reference_on_grid(
 
     Fast logs are held from message to message, as the controller does.  Slow logs are interpolated by a monotone cubic;
     where the reference leaves or reaches its rest value between two samples, the moving part is extrapolated to it.
+    Of messages that came at one instant the last one holds.
     """
+    later = np.append(np.diff(time) > 0.0, True)
+    time, values = time[later], values[later]
     grid = np.arange(max(2, math.floor(duration / period + 1e-6) + 1)) * period
     step = float(np.median(np.diff(time))) if time.size > 1 else period
     if time.size < 4 or 1.0 / step >= hold_rate:
