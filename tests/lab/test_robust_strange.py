@@ -76,6 +76,7 @@ def test_a_strange_hand_lacks_nothing(tmp_path: Path) -> None:
     found = diagnosed(strange_set(tmp_path))
     assert found.verdict == "nothing"
     assert any("something was grasped" in note for note in found.notes)
+    assert any(note.startswith("grasp: fitted too") and "N.m/rad" in note for note in found.notes)
 
 
 def test_a_strange_hand_may_rest_off_its_open_stop(tmp_path: Path) -> None:

@@ -30,6 +30,8 @@ __all__ = ["HandRig", "make_controller", "object_of", "sensors_of"]
 Array = NDArray[np.float64]
 
 _PER_OBJECT = ("object.stiffness", "object.position")
+_OBJECT_UNITS = {"object.stiffness": "N.m/rad", "object.position": "rad", "object.damping": "N.m.s/rad"}
+"""Of the whole grasp, as the pulley feels it."""
 
 _UNKNOWN_OBJECT_SD = {"object.stiffness": 1.5, "object.position": 2.0}
 _UNKNOWN_DAMPING_SD = 1.5
@@ -199,13 +201,13 @@ class HandRig(PlantRig):
                     width = sd if known else _UNKNOWN_OBJECT_SD[name]
                     step = 0.5 if known else WIDE_STEP
                     place = f"{name}@{trial.name}"
-                    out.append(Nuisance(place, plant.get(name), width, relative, scatter, step=step))
+                    unit = _OBJECT_UNITS[name]
+                    out.append(Nuisance(place, plant.get(name), width, relative, scatter, unit, step))
                     damping = "object.damping"
                     if name == "object.stiffness" and not known and damping in plant.names:
                         place = f"{damping}@{trial.name}"
-                        out.append(
-                            Nuisance(place, plant.get(damping), _UNKNOWN_DAMPING_SD, True, step=WIDE_STEP)
-                        )
+                        unit, width = _OBJECT_UNITS[damping], _UNKNOWN_DAMPING_SD
+                        out.append(Nuisance(place, plant.get(damping), width, True, 0.0, unit, WIDE_STEP))
             elif name == _ZERO:
                 if sum(map(is_described, self.trials)) > 1:
                     out.append(Nuisance(HAND_ZERO, 0.0, sd, False, unit="rad"))

@@ -158,13 +158,17 @@ def _ends(best: Candidate) -> list[str]:
 
 
 def _undescribed(best: Candidate) -> list[str]:
-    """What the recordings do not say of the machine as a whole, as it was fitted."""
-    fitted = [
-        f"{c.name} {c.value(float(z)):.3g} {c.unit}".rstrip()
-        for c, z in zip(best.fit.coordinates, best.fit.z, strict=True)
-        if c.wide and "@" not in c.name
+    """What the recordings do not say of the machine as a whole, and of each recording, as it was fitted."""
+    fitted: dict[str, list[str]] = {"": []}
+    for c, value in zip(best.fit.coordinates, best.fit.values.values(), strict=True):
+        name, _, place = c.name.partition("@")
+        if c.wide:
+            fitted.setdefault(place, []).append(f"{name} {value:.3g} {c.unit}".rstrip())
+    whole = fitted.pop("")
+    return [f"the recordings do not tell these, so they were fitted: {', '.join(whole)}"] * bool(whole) + [
+        f"{place}: fitted too, as the recording does not tell: {', '.join(own)}"
+        for place, own in fitted.items()
     ]
-    return [f"the recordings do not tell these, so they were fitted: {', '.join(fitted)}"] if fitted else []
 
 
 def _identifiability(best: Candidate) -> list[str]:
