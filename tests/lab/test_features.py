@@ -1,9 +1,11 @@
 """Two simulated closures stand for all of them only where the machine comes back to where it was."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hannes_description.model import Model
-from hannes_lab.features import build_features, compact_end
+from hannes_lab.features import SAME, build_features, compact_end
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
 from hannes_lab.trials import Trial, make_trial
@@ -42,3 +44,34 @@ def test_a_hand_whose_joints_stick_is_simulated_whole(trial):
     ticks, worst = ticks_and_worst(trial, 0.03)
     assert ticks == trial.reference.size
     assert worst == 0.0
+
+
+def by_hand(trial: Trial, scatter: float) -> Trial:
+    """The trial with closures of which the amplitudes differ, as those of an operator do."""
+    rng = np.random.default_rng(3)
+    factor = np.ones(trial.reference.size)
+    for closure in trial.closures:
+        ticks = slice(round(closure.start / trial.period), round(closure.stop / trial.period))
+        factor[ticks] = 1.0 + scatter * rng.standard_normal()
+    return replace(trial, reference=trial.reference * factor)
+
+
+def test_closures_that_an_operator_repeats_nearly_are_simulated_for_two(trial):
+    """What they differ by is exact where it was taken, and hardly another for a model that is a tenth off."""
+    trial = by_hand(trial, 0.004)
+    assert SAME < trial.apart < 0.02 and compact_end(trial, SAME) is None
+    model, rig = Model.load(), HandRig([trial])
+    features = build_features([trial], SIGNALS)
+    assert features.nearly == {0}
+    compacted = features.compacted(rig, model, {})
+    off = {"motor.resistance": 1.1 * model.parameters.value("motor.resistance")}
+    for values, part in (({}, 1e-9), (off, 0.1)):
+        exact, quick = (f.closures(rig, model, values) for f in (features, compacted))
+        bare = [replace(block, beside=np.zeros_like(block.measured)) for block in compacted.blocks]
+        plain = replace(compacted, blocks=tuple(bare))
+        for block, a, b, c in zip(
+            features.blocks, exact, quick, plain.closures(rig, model, values), strict=True
+        ):
+            left, without = (float(np.sqrt(np.mean((a - other) ** 2))) for other in (b, c))
+            assert without > 1e-3 * float(np.ptp(block.measured))
+            assert left < part * without

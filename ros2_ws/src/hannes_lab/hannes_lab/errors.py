@@ -129,7 +129,11 @@ def split_closures(features: Features) -> tuple[Features, Features]:
 
             blocks.append(
                 replace(
-                    block, measured=block.measured[pick], full=cut(block.full), compact=cut(block.compact)
+                    block,
+                    measured=block.measured[pick],
+                    full=cut(block.full),
+                    compact=cut(block.compact),
+                    beside=None if block.beside is None else block.beside[pick],
                 )
             )
         return replace(features, blocks=tuple(blocks), slices=())

@@ -3,13 +3,14 @@
 A feature vector is linear in the signals, and the same for measurement and simulation: each closure is sampled at the
 measured instants, interpolated onto a phase grid, and combined over the closures.  The simulation of a model without
 memory repeats itself from the second closure of a condition on, so only two closures are simulated and the rest is
-taken from the second.  Recordings that each begin anew repeat the first of them.
+taken from the second.  Recordings that each begin anew repeat the first of them.  Where the references of the closures
+differ a little (an operator's amplitude), so do the closures: by how much is taken from one whole simulation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -21,7 +22,7 @@ from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
 from .rig import Rig
-from .trials import Closure, Trial
+from .trials import Trial
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -37,8 +38,13 @@ FINEST = 1e-5
 repeats itself bit for bit; they are taken to be known by the second, as by a sensor of 17 bits, or as another machine's
 rig says (`finest`)."""
 
-MOST_SHIFT = 15
-"""Ticks by which a closure may begin earlier or later than where its reference was seen to move."""
+SAME = 5e-4
+NEARLY = 0.02
+"""Mean difference of the references of two closures, in their span, up to which one repeats the other, and up to which
+it does so but for a difference that hardly depends on the model."""
+
+ALIKE = 2e-3
+"""The same for recordings that begin anew, of which the first stands for all."""
 
 
 def alike(closures: Array) -> Array:
@@ -61,6 +67,7 @@ class Block:
     measured   (n, p) the closures on the phase grid
     before, after, weight   (n, p) samples [ticks of the simulation] and interpolation weight of each point
     compact    the same three for a simulation of the closures only that others repeat; None where that does not hold
+    beside     (n, p) what closures differ by from those of a compact simulation, where they repeat each other nearly
     finest     of the signal's span: scatter that is assumed where closures are all the same
     """
 
@@ -73,6 +80,7 @@ class Block:
     compact: tuple[Index, Index, Array] | None
     unit: str = ""
     finest: float = FINEST
+    beside: Array | None = None
 
     @property
     def n(self) -> int:
@@ -108,7 +116,8 @@ class Block:
     def predicted(self, ticks: Array, compact: bool) -> Array:
         """Closures (n, p) from a simulated signal on the control grid."""
         before, after, weight = self.compact if compact and self.compact is not None else self.full
-        return ticks[before] * (1.0 - weight) + ticks[after] * weight
+        closures: Array = ticks[before] * (1.0 - weight) + ticks[after] * weight
+        return closures + self.beside if compact and self.beside is not None else closures
 
 
 @dataclass(frozen=True)
@@ -117,11 +126,14 @@ class Features:
 
     blocks         one per trial, condition and signal
     ends           per trial, ticks that a compact simulation needs (None: it must be simulated whole)
+    nearly         trials whose closures repeat each other only nearly: a compact simulation will do where `beside` is
+                   known (see `compacted`)
     """
 
     trials: tuple[Trial, ...]
     blocks: tuple[Block, ...]
     ends: tuple[int | None, ...]
+    nearly: frozenset[int] = frozenset()
     slices: tuple[slice, ...] = field(default=())
     _wanted: tuple[tuple[str, ...], ...] = field(init=False, repr=False, compare=False)
 
@@ -159,13 +171,12 @@ class Features:
     def closures(self, rig: Rig, model: Model, values: Mapping[str, float]) -> list[Array]:
         """Predicted closures (n, p) of every block."""
         memory = has_memory(model)
+        known = {block.trial for block in self.blocks if block.beside is not None}
         runs: list[tuple[Mapping[str, Array], bool]] = []
         for number, (trial, end) in enumerate(zip(self.trials, self.ends, strict=True)):
             compact = end is not None and (trial.anew or not memory)
-            reference = trial.reference[:end] if compact else trial.reference
-            signals = rig.simulate(model, values, trial, reference)
-            check_simulated(signals, self._wanted[number], trial, reference.size, rig)
-            runs.append((signals, compact and not _whole(signals, trial)))
+            compact &= number not in self.nearly or number in known
+            runs.append(self._simulated(rig, model, values, number, end if compact else None))
         out = [
             block.predicted(runs[block.trial][0][block.signal], runs[block.trial][1]) for block in self.blocks
         ]
@@ -176,6 +187,43 @@ class Features:
                     f"in condition '{block.condition}': it must give finite numbers wherever the machine moves."
                 )
         return out
+
+    def _simulated(
+        self, rig: Rig, model: Model, values: Mapping[str, float], number: int, end: int | None
+    ) -> tuple[Mapping[str, Array], bool]:
+        """Signals of a trial up to a tick (None: all of it), and whether that is where they end."""
+        trial = self.trials[number]
+        reference = trial.reference[:end]
+        signals = rig.simulate(model, values, trial, reference)
+        check_simulated(signals, self._wanted[number], trial, reference.size, rig)
+        return signals, end is not None and not _whole(signals, trial)
+
+    def compacted(self, rig: Rig, model: Model, values: Mapping[str, float]) -> Features:
+        """The same, so that compact simulations will do where closures repeat each other nearly.
+
+        What they differ by is taken from a whole simulation at these values.  A model with a memory, or one that
+        diverges or does not come back to where it was, does not tell it: then what was known before stays.
+        """
+        if not self.nearly or has_memory(model):
+            return self
+        blocks = list(self.blocks)
+        for number in self.nearly:
+            try:
+                short, compact = self._simulated(rig, model, values, number, self.ends[number])
+                if not compact:
+                    continue
+                whole, _ = self._simulated(rig, model, values, number, None)
+            except PlantDiverged:
+                continue
+            for k, block in enumerate(blocks):
+                if block.trial == number:
+                    bare = replace(block, beside=None)
+                    beside = bare.predicted(whole[block.signal], False) - bare.predicted(
+                        short[block.signal], True
+                    )
+                    if np.isfinite(beside).all():
+                        blocks[k] = replace(block, beside=beside)
+        return replace(self, blocks=tuple(blocks), slices=())
 
     def predict(self, rig: Rig, model: Model, values: Mapping[str, float]) -> Array:
         """Features of the model (size,)."""
@@ -253,28 +301,20 @@ def build_features(
         raise HannesError(
             f"None of the signals {', '.join(signals)} covers a whole closure in these recordings."
         )
-    return Features(tuple(trials), tuple(blocks), tuple(ends))
+    nearly = [k for k, end in enumerate(ends) if end is not None and compact_end(trials[k], SAME) is None]
+    return Features(tuple(trials), tuple(blocks), tuple(ends), frozenset(nearly))
 
 
-def compact_end(trial: Trial) -> int | None:
-    """Ticks up to the end of the last closure that others repeat, if all closures have the same reference."""
+def compact_end(trial: Trial, most: float = NEARLY) -> int | None:
+    """Ticks up to the end of the last closure that others repeat, if all closures have (nearly) the same reference.
+
+    most  mean difference of the references, in their span; what begins anew must be ALIKE
+    """
     repeats = trial.repeats
     if len(trial.conditions) != 1 or len(trial.closures) <= len(set(repeats)):
         return None
-    for closure, number in zip(trial.closures, repeats, strict=True):
-        like = trial.closures[number]
-        if closure is like:
-            continue
-        n = round(min(c.stop - c.start for c in (like, closure)) / trial.period)
-        a = round(like.start / trial.period)
-        k = _same_place(trial, closure, like)
-        skip = max(0, -a, -k)  # a closure may begin a moment before the recording
-        shape = trial.reference[a + skip : a + n]
-        span = float(np.ptp(shape)) or 1.0
-        other = trial.reference[k + skip : k + n]
-        # A fresh reference sample may fall one tick earlier or later from closure to closure.
-        if other.size < shape.size or np.mean(np.abs(other - shape)) > 2e-3 * span:
-            return None
+    if trial.apart > (ALIKE if trial.anew else most):
+        return None
     return min(trial.reference.size, round(trial.closures[max(repeats)].stop / trial.period) + 60)
 
 
@@ -284,26 +324,6 @@ def stands_for_all(trial: Trial) -> bool:
         return True
     later = [c for c in trial.closures if 0.5 * (c.start + c.stop) > trial.parts[1].begin]
     return not later or compact_end(trial) is not None
-
-
-def _same_place(trial: Trial, closure: Closure, like: Closure) -> int:
-    """Tick at which the reference of a closure begins to be that of another one.
-
-    Where the logged reference is coarse, the closure's start is known to one of its steps; the whole curve says more.
-    """
-    a, k = round(like.start / trial.period), round(closure.start / trial.period)
-    skip = max(0, -a)
-    n = round((like.stop - like.start) / trial.period) - skip
-    shape = trial.reference[a + skip : a + skip + n]
-
-    def apart(at: int) -> float:
-        other = trial.reference[at : at + n]
-        return float(np.mean(np.abs(other - shape[: other.size]))) if at >= 0 and other.size else np.inf
-
-    k += skip
-    if apart(k) == 0.0:
-        return k - skip
-    return min(range(k - MOST_SHIFT, k + MOST_SHIFT + 1), key=lambda at: (apart(at), abs(at - k))) - skip
 
 
 def _block(
@@ -336,7 +356,7 @@ def _block(
         full.append((sample_tick[left], sample_tick[right], weight))
         if limit is not None:
             here = round(base.start / trial.period)
-            shift = 0 if closure is base else here - _same_place(trial, closure, base)
+            shift = 0 if closure is base else here - trial.same_place(closure, base)
             compact.append(
                 (
                     np.clip(sample_tick[left] + shift, 0, limit - 1),

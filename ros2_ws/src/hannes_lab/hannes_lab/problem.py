@@ -251,6 +251,7 @@ def build_problem(
     Where a condition has a single closure its scatter is that of the priors (closure_sd), and its sample variance is
     taken from the roughness of the curve.
     """
+    features = features.compacted(rig, model, values)
     base = features.closures(rig, model, values)
     # What the model says of the differences between closures (a motor that heats up) is no scatter, and what it gets
     # wrong of the first, which starts from another state, is none either; where that is hardly seen, it stays scatter.

@@ -48,6 +48,9 @@ HELD = 0.05
 LONGEST_GAP = 5.0
 """Steps of a signal without a sample that are bridged by interpolation."""
 
+MOST_SHIFT = 15
+"""Ticks by which a closure may begin earlier or later than where its reference was seen to move."""
+
 EARLY = 0.1
 """s that a closure may begin before its recording: the reference stands there."""
 
@@ -147,6 +150,48 @@ class Trial:
         until = self.parts[1].begin
         base = {c.number: k for k, c in enumerate(self.closures) if 0.5 * (c.start + c.stop) < until}
         return tuple(base.get(c.number, k) for k, c in enumerate(self.closures))
+
+    @cached_property
+    def apart(self) -> float:
+        """Largest mean difference between the references of a closure and of the one that it repeats, in its span.
+
+        Infinite where one is not as long as the other; a few ticks may be missing of the rest at the end.
+        """
+        most = 0.0
+        for closure, number in zip(self.closures, self.repeats, strict=True):
+            like = self.closures[number]
+            if closure is like:
+                continue
+            n = round(min(c.stop - c.start for c in (like, closure)) / self.period)
+            a = round(like.start / self.period)
+            k = self.same_place(closure, like)
+            skip = max(0, -a, -k)  # a closure may begin a moment before the recording
+            shape, other = self.reference[a + skip : a + n], self.reference[k + skip : k + n]
+            if other.size < shape.size - MOST_SHIFT:
+                return math.inf
+            span = float(np.ptp(shape)) or 1.0
+            # A fresh reference sample may fall one tick earlier or later from closure to closure.
+            most = max(most, float(np.mean(np.abs(other - shape[: other.size]))) / span)
+        return most
+
+    def same_place(self, closure: Closure, like: Closure) -> int:
+        """Tick at which the reference of a closure begins to be that of another one.
+
+        Where the logged reference is coarse, a closure's start is known to one of its steps; the whole curve says more.
+        """
+        a, k = round(like.start / self.period), round(closure.start / self.period)
+        skip = max(0, -a)
+        n = round((like.stop - like.start) / self.period) - skip
+        shape = self.reference[a + skip : a + skip + n]
+
+        def apart(at: int) -> float:
+            other = self.reference[at : at + n]
+            return float(np.mean(np.abs(other - shape[: other.size]))) if at >= 0 and other.size else math.inf
+
+        k += skip
+        if apart(k) == 0.0:
+            return k - skip
+        return min(range(k - MOST_SHIFT, k + MOST_SHIFT + 1), key=lambda at: (apart(at), abs(at - k))) - skip
 
     def mean_closure(self, signal: str, phase: Array) -> Array:
         """Mean of a signal over the closures of the first condition at these times (p,) since their start [s]."""
