@@ -62,7 +62,7 @@ def test_closures_that_an_operator_repeats_nearly_are_simulated_for_two(trial):
     assert SAME < trial.apart < 0.02 and compact_end(trial, SAME) is None
     model, rig = Model.load(), HandRig([trial])
     features = build_features([trial], SIGNALS)
-    assert features.nearly == {0}
+    assert features.nearly == (0,)
     compacted = features.compacted(rig, model, {})
     off = {"motor.resistance": 1.1 * model.parameters.value("motor.resistance")}
     for values, part in (({}, 1e-9), (off, 0.1)):

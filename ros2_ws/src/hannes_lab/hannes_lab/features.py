@@ -133,7 +133,7 @@ class Features:
     trials: tuple[Trial, ...]
     blocks: tuple[Block, ...]
     ends: tuple[int | None, ...]
-    nearly: frozenset[int] = frozenset()
+    nearly: tuple[int, ...] = ()
     slices: tuple[slice, ...] = field(default=())
     _wanted: tuple[tuple[str, ...], ...] = field(init=False, repr=False, compare=False)
 
@@ -302,7 +302,7 @@ def build_features(
             f"None of the signals {', '.join(signals)} covers a whole closure in these recordings."
         )
     nearly = [k for k, end in enumerate(ends) if end is not None and compact_end(trials[k], SAME) is None]
-    return Features(tuple(trials), tuple(blocks), tuple(ends), frozenset(nearly))
+    return Features(tuple(trials), tuple(blocks), tuple(ends), tuple(nearly))
 
 
 def compact_end(trial: Trial, most: float = NEARLY) -> int | None:

@@ -120,6 +120,7 @@ class Search:
     found: dict[Names, Candidate] = field(default_factory=dict)
     _nominal: dict[bytes, Fit] = field(default_factory=dict)
     _minima: dict[bytes, tuple[Fit, ...]] = field(default_factory=dict)
+    _scans: dict[tuple[bytes, str], list[Scored]] = field(default_factory=dict)
     _key: str = ""
 
     def __post_init__(self) -> None:
@@ -406,6 +407,7 @@ class Search:
             found={},
             _nominal={},
             _minima={},
+            _scans={},
             _key="",
         )
 
@@ -454,7 +456,12 @@ class Search:
         points = self.each(Search._at_nominal, [(base,) for base in bases], f"{text}: nominal values")
         self._nominal.clear()
         self._nominal.update((point_key(base.fit), point) for base, point in zip(bases, points, strict=True))
-        scans = self.each(Search._scanned, list(todo.values()), f"{text}: scan")
+        # A thorough search scans the same places.
+        keys = [(point_key(base.fit), name) for base, name in todo.values()]
+        new = [item for item, key in zip(todo.values(), keys, strict=True) if key not in self._scans]
+        for (base, name), scan in zip(new, self.each(Search._scanned, new, f"{text}: scan"), strict=True):
+            self._scans[point_key(base.fit), name] = scan
+        scans = [self._scans[key] for key in keys]
         order = sorted(zip(todo.values(), scans, strict=True), key=lambda item: item[1][0][0])
         least = order[0][1][0][0] if order else np.inf
         chosen = [
