@@ -446,7 +446,8 @@ class Search:
         """The bases with one further effect each, sorted by penalised cost.
 
         All extensions are scanned; the most promising are refitted in closed loop, the POLISH best of them with all
-        derivatives taken afresh, as far as their penalised cost is below `worth`.
+        derivatives taken afresh, as far as their penalised cost is below `worth`; all of them where that leads to none
+        that is, or to one that is as far off as its base: they may be on a bent way.
         """
         todo: dict[Names, tuple[Candidate, str]] = {}
         for base in bases:
@@ -479,7 +480,21 @@ class Search:
         most = min(worth, HOPELESS * ranked[0].penalised) if self.slow and ranked else worth
         done = {c.names for c in ended}
         worthy = [c for c in ranked[:POLISH] if c.penalised < most and c.names not in done]
-        polished = self.each(Search._polish, [(c,) for c in worthy], f"{text}: polish")
+        ranked = self._polished(ranked, worthy, text)
+        if not self.slow and ranked and (ranked[0].pulled or ranked[0].penalised >= worth):
+            off = {key for key, (base, _) in todo.items() if base.pulled}
+            done |= {c.names for c in worthy}
+            bent = [
+                c
+                for c in ranked[:REFIT]
+                if c.pulled and tuple(sorted(c.names)) in off and c.names not in done
+            ]
+            ranked = self._polished(ranked, bent, text)
+        return ranked
+
+    def _polished(self, ranked: Sequence[Candidate], some: Sequence[Candidate], text: str) -> list[Candidate]:
+        """The candidates, of which some are fitted with all derivatives afresh; sorted by penalised cost."""
+        polished = self.each(Search._polish, [(c,) for c in some], f"{text}: polish")
         better = {c.names: self._known(c) for c in polished}
         return sorted((better.get(c.names, c) for c in ranked), key=lambda c: c.penalised)
 
