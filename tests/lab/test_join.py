@@ -12,7 +12,8 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.errors import repeatability
-from hannes_lab.features import build_features, compact_end
+from hannes_lab.features import SAME, build_features, compact_end
+from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
 from hannes_lab.join import ENOUGH, Loaded, join_repeats
 from hannes_lab.prepare import load_trials, prepare
@@ -97,6 +98,29 @@ def test_recordings_of_a_simulator_that_is_started_anew_repeat_its_first_closure
     assert [e.name for e in found.effects] == ["glove_stiffness"]
     stiffness = found.effects[0].parameters["stiffness"]
     assert stiffness.low <= 0.002 <= stiffness.high or stiffness.value == pytest.approx(0.002, rel=0.1)
+
+
+def test_recordings_that_begin_anew_and_repeat_nearly_are_simulated_one_by_one_once() -> None:
+    """An operator's references: the first stands for all, but for what they differ by, which is taken once."""
+    model, rng = Model.load(), np.random.default_rng(4)
+    alone = []
+    for k in range(CLOSURES):
+        trial = make_trial(anew(model, 21 + k)[0])
+        by_hand = trial.reference * (1.0 + 0.004 * rng.standard_normal())
+        alone.append(replace(trial, name=f"fast_{k}", reference=by_hand, source="", fresh=True))
+    (joined,) = join_repeats([Loaded(trial, "fast") for trial in alone])
+    assert joined.anew and SAME < joined.apart < 0.02
+    features, rig = build_features([joined], ["motor_current"]), HandRig([joined])
+    found = features.closures(rig, model, {})[0]
+    names = [part.name for part in joined.parts]
+    for trial in alone:
+        own = build_features([trial], ["motor_current"])
+        np.testing.assert_allclose(own.blocks[0].phase, features.blocks[0].phase)
+        (curve,) = own.closures(HandRig([trial]), model, {})[0]
+        np.testing.assert_allclose(found[names.index(trial.name)], curve, atol=1e-6)
+    assert float(np.abs(found - found[0]).max()) > 3e-3 * float(np.ptp(found)), "their references differ"
+    quick = features.compacted(rig, model, {})
+    np.testing.assert_allclose(quick.closures(rig, model, {})[0], found, atol=1e-9)
 
 
 def test_several_closures_begun_anew_repeat_those_of_the_longest_recording() -> None:

@@ -296,6 +296,7 @@ def _check_parts(trial: Trial, where: str) -> None:
         f"there are {len(trial.conditions)} conditions in it" if len(trial.conditions) > 1 else "they are not"
     )
     raise HannesError(
-        f"{where}: it is `fresh`, so each of its {len(trial.parts)} parts must repeat the first, its reference equal "
-        f"tick by tick; {many}. Give the recordings as trials of their own: those that repeat one condition are joined."
+        f"{where}: it is `fresh`, so each of its {len(trial.parts)} parts must repeat the first, its reference "
+        f"(nearly) equal tick by tick; {many}. Give the recordings as trials of their own: those that repeat one "
+        "condition are joined."
     )

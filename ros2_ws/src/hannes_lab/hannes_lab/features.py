@@ -43,9 +43,6 @@ NEARLY = 0.02
 """Mean difference of the references of two closures, in their span, up to which one repeats the other, and up to which
 it does so but for a difference that hardly depends on the model."""
 
-ALIKE = 2e-3
-"""The same for recordings that begin anew, of which the first stands for all."""
-
 
 def alike(closures: Array) -> Array:
     """Closures (n, p) without the first of four or more, which starts from another state than the others."""
@@ -193,10 +190,17 @@ class Features:
     ) -> tuple[Mapping[str, Array], bool]:
         """Signals of a trial up to a tick (None: all of it), and whether that is where they end."""
         trial = self.trials[number]
-        reference = trial.reference[:end]
-        signals = rig.simulate(model, values, trial, reference)
-        check_simulated(signals, self._wanted[number], trial, reference.size, rig)
-        return signals, end is not None and not _whole(signals, trial)
+        if end is None and trial.anew:
+            begins = [round(part.begin / trial.period) for part in trial.parts]
+            references = np.split(trial.reference, begins[1:])
+        else:
+            references = [trial.reference[:end]]
+        runs = [rig.simulate(model, values, trial, reference) for reference in references]
+        for signals, reference in zip(runs, references, strict=True):
+            check_simulated(signals, self._wanted[number], trial, reference.size, rig)
+        if len(runs) == 1:
+            return runs[0], end is not None and not _whole(runs[0], trial)
+        return {name: np.concatenate([run[name] for run in runs]) for name in self._wanted[number]}, False
 
     def compacted(self, rig: Rig, model: Model, values: Mapping[str, float]) -> Features:
         """The same, so that compact simulations will do where closures repeat each other nearly.
@@ -308,12 +312,12 @@ def build_features(
 def compact_end(trial: Trial, most: float = NEARLY) -> int | None:
     """Ticks up to the end of the last closure that others repeat, if all closures have (nearly) the same reference.
 
-    most  mean difference of the references, in their span; what begins anew must be ALIKE
+    most  mean difference of the references, in their span
     """
     repeats = trial.repeats
     if len(trial.conditions) != 1 or len(trial.closures) <= len(set(repeats)):
         return None
-    if trial.apart > (ALIKE if trial.anew else most):
+    if trial.apart > most:
         return None
     return min(trial.reference.size, round(trial.closures[max(repeats)].stop / trial.period) + 60)
 

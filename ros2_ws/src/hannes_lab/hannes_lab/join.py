@@ -99,7 +99,7 @@ def _one_or_all(group: list[Loaded], fresh: bool | None) -> list[Trial]:
         return [_joined(group)]
     first = _typical(trials)
     joined = _joined([group[first], *group[:first], *group[first + 1 :]], fresh=True)
-    # Where the references do not match tick by tick, a simulation would go through them as if they were one.
+    # Where the references do not match, a simulation would go through them as if they were one.
     return [joined] if stands_for_all(joined) else trials
 
 
