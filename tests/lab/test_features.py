@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hannes_description.model import Model
-from hannes_lab.features import SAME, build_features, compact_end
+from hannes_lab.features import build_features, compact_end
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.trials import SAME, Trial, make_trial
 from hannes_sim.effect import load_effect
 
 SIGNALS = ("encoder_position", "motor_current")

@@ -12,12 +12,12 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.errors import repeatability
-from hannes_lab.features import SAME, build_features, compact_end
+from hannes_lab.features import build_features, compact_end
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
 from hannes_lab.join import ENOUGH, Loaded, join_repeats
 from hannes_lab.prepare import load_trials, prepare
-from hannes_lab.trials import make_trial
+from hannes_lab.trials import SAME, make_trial
 from hannes_sim.effect import strength_of
 from lab.foreign_bags import hannes
 

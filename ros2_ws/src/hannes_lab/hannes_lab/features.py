@@ -22,7 +22,7 @@ from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
 from .rig import Rig
-from .trials import Trial
+from .trials import SAME, Trial
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -38,10 +38,9 @@ FINEST = 1e-5
 repeats itself bit for bit; they are taken to be known by the second, as by a sensor of 17 bits, or as another machine's
 rig says (`finest`)."""
 
-SAME = 5e-4
 NEARLY = 0.02
-"""Mean difference of the references of two closures, in their span, up to which one repeats the other, and up to which
-it does so but for a difference that hardly depends on the model."""
+"""Mean difference of the references of two closures, in their span, up to which one repeats the other but for a
+difference that hardly depends on the model."""
 
 
 def alike(closures: Array) -> Array:

@@ -28,7 +28,7 @@ from hannes_sim.ports import R_Q, R_QL
 from hannes_sim.rollout import Controller, Rollout, rollout, step_of
 from numpy.typing import NDArray
 
-from .trials import Trial
+from .trials import SAME, Trial
 
 if TYPE_CHECKING:
     from .features import Block
@@ -340,13 +340,14 @@ def _came_back(run: Rollout, trial: Trial) -> bool:
     """Whether the second closure ends where the first did, on both sides of the wire: then all repeat it.
 
     A hand whose joints stick stays where they stop, a little further with each closure, which the encoder hardly shows.
-    Where the references of the closures differ, their ends do too.
+    Where closures repeat each other only nearly, their ends differ too.
     """
     ends = [round(closure.stop / trial.period) for closure in trial.closures[:2]]
     if len(ends) < 2 or ends[1] >= run.raw.shape[0]:
         return True
     here, there = run.raw[ends[0], [R_Q, R_QL]], run.raw[ends[1], [R_Q, R_QL]]
-    return bool(np.abs(here - there).max() <= (COMES_BACK + trial.apart) * trial.span)
+    most = COMES_BACK + (trial.apart if trial.apart > SAME else 0.0)
+    return bool(np.abs(here - there).max() <= most * trial.span)
 
 
 def _wanted(model: Model, values: Mapping[str, float], trial: Trial) -> dict[str, float]:

@@ -48,6 +48,9 @@ HELD = 0.05
 LONGEST_GAP = 5.0
 """Steps of a signal without a sample that are bridged by interpolation."""
 
+SAME = 5e-4
+"""Mean difference of the references of two closures, in their span, up to which one repeats the other."""
+
 MOST_SHIFT = 15
 """Ticks by which a closure may begin earlier or later than where its reference was seen to move."""
 
