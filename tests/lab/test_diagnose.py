@@ -13,7 +13,8 @@ from hannes_lab.chance import chance
 from hannes_lab.choose import Choice, pruned
 from hannes_lab.compare import compare
 from hannes_lab.diagnose import diagnose, effect_sources
-from hannes_lab.diagnosis import Diagnosis
+from hannes_lab.diagnosis import Diagnosis, Fall
+from hannes_lab.falls import fall_sentence
 from hannes_lab.fit import Fit, fit
 from hannes_lab.hide import DEFAULT_CONDITIONS, Truth, make_set
 from hannes_lab.prepare import Prepared, prepare
@@ -343,3 +344,20 @@ def test_a_glove_is_told_from_the_hands_own_spring_as_far_as_the_tolerance_of_th
     total = spring * prepared.model.parameters.value("hand.stiffness") + weak.values["stiffness"]
     here = found.values["hand.stiffness"] + found.values["glove_stiffness.stiffness"]
     assert here == pytest.approx(total, rel=0.02)
+
+
+def test_an_error_that_rises_is_said_to_rise() -> None:
+    """A fit weighs what is known of the model's own error; its error may be larger than before."""
+
+    def fall(added: str, held_out: float, of: dict[str, float]) -> Fall:
+        return Fall(added, held_out, held_out, of, (), {}, held_out)
+
+    steps = [fall("nominal, as given", 9.0, {}), fall("nominal, fitted", 4.0, {"slow": 3.0, "fast": 5.0})]
+    better, worse = (
+        fall("gravity", 2.0, {"slow": 1.0, "fast": 3.0}),
+        fall("gravity", 4.5, {"slow": 1.0, "fast": 6.0}),
+    )
+    assert "falls from 4.00 (nominal, fitted) to 2.00 times" in fall_sentence([*steps, better])
+    said = fall_sentence([*steps, worse])
+    assert "rises from 4.00 (nominal, fitted) to 4.50 times" in said
+    assert "'slow' from 3.00 to 1.00, 'fast' from 5.00 to 6.00" in said

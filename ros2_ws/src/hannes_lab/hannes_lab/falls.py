@@ -105,11 +105,20 @@ def worth_showing(
 
 
 def fall_sentence(falls: Sequence[Fall]) -> str:
-    """How the error on held-out closures falls; says so where there is one closure only."""
+    """How the error on held-out closures falls, or that it does not; says so where there is one closure only.
+
+    A fit weighs what is known of the model's own error; the error does not.
+    """
     before, after = falls[1].held_out, falls[-1].held_out
     if not np.isfinite([before, after]).all():
         return NO_REPEATS
-    return (
-        f"The error on held-out closures falls from {before:.2f} (nominal, fitted) to {after:.2f} times the "
-        "repeatability."
+    verb = "falls" if after <= before else "rises"
+    said = (
+        f"The error on held-out closures {verb} from {before:.2f} (nominal, fitted) to {after:.2f} times the "
+        "repeatability"
     )
+    if after <= before:
+        return f"{said}."
+    old, new = falls[1].by_condition, falls[-1].by_condition
+    each = [f"'{name}' from {old[name]:.2f} to {error:.2f}" for name, error in new.items() if name in old]
+    return f"{said} (conditions left out: {', '.join(each)})." if each else f"{said}."
