@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Any
 
@@ -170,16 +170,23 @@ def found_effects(
     search: Search, best: Candidate, limits: Chance, falls: Sequence[Fall]
 ) -> tuple[FoundEffect, ...]:
     """The effects of a fitted set with parameters, intervals and the reason."""
-    return tuple(_found(search, best, name, limits, falls) for name in best.names)
-
-
-def _found(search: Search, best: Candidate, name: str, limits: Chance, falls: Sequence[Fall]) -> FoundEffect:
-    kind = search.effect(name)
     intervals = intervals_of(best.fit, limits)
     at_end = {c.name for c in at_end_of_range(best.fit)}
+    return tuple(_found(search, best.fit, name, intervals, at_end, falls) for name in best.names)
+
+
+def _found(
+    search: Search,
+    best: Fit,
+    name: str,
+    intervals: Mapping[str, tuple[float, float]],
+    at_end: Set[str],
+    falls: Sequence[Fall],
+) -> FoundEffect:
+    kind = search.effect(name)
     parameters = {}
     for p in kind.parameters:
-        value = best.fit.values[f"{name}.{p.name}"]
+        value = best.values[f"{name}.{p.name}"]
         low, high = intervals[f"{name}.{p.name}"]
         span = p.upper - p.lower
         parameters[p.name] = ParameterEstimate(
