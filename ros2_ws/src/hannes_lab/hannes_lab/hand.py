@@ -61,6 +61,10 @@ HAND_ZERO = "encoder.hand_zero"
 """The part of the encoder's zero that described recordings of one hand share; each has its own beside it, as the hand
 may have been homed anew.  Without it the tolerance would be charged once per recording."""
 
+LOWEST = "encoder.lowest"
+"""The motor of a hand that nobody described unwinds no farther than its encoder ever showed: some pulleys stop where
+the hand is open, others run on along a slack wire."""
+
 HOMING = "encoder.homing"
 _UNKNOWN_HOMING_SD = 1.0
 """rad; how far the wire is wound up, and the hand off its open stop, where an encoder reads zero whose homing nobody
@@ -174,6 +178,11 @@ class HandRig(PlantRig):
     def __init__(self, trials: Sequence[Trial]) -> None:
         super().__init__(trials)
         self._sensors = {trial.name: sensors_of(trial) for trial in self.trials}
+        self._lowest = {
+            trial.name: float(trial.signals["encoder_position"][1].min())
+            for trial in self.trials
+            if "encoder_position" in trial.signals and not is_described(trial)
+        }
 
     @property
     def finest(self) -> float:
@@ -316,7 +325,9 @@ class HandRig(PlantRig):
         if shift or wound:
             zero = f"{_ZERO}@{trial.name}"
             of_plant[zero] = of_plant.get(zero, 0.0) + shift - wound
-        _, controller, _ = self._plant(model, trial)
+        plant, controller, _ = self._plant(model, trial)
+        if trial.name in self._lowest and LOWEST in plant.names:
+            of_plant[LOWEST] = self._lowest[trial.name]
         if isinstance(controller, DoublePID):
             controller.parameters[:] = replace(controller.settings, **gains).to_array()
         return self._run(model, of_plant, trial, _moved(reference, delay, lead, trial), before)

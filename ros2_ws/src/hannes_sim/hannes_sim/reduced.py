@@ -6,7 +6,8 @@
 
 return(ql) = preload + stiffness ql; the object is a spring and damper that pushes back only.  Dry friction (it sticks
 exactly) and the damping of hand and object are solved implicitly, the rest semi-implicitly.  A wire of zero stiffness
-switches the load side off: a single mass with a motor, which is what many single-drive machines are.
+switches the load side off: a single mass with a motor, which is what many single-drive machines are.  Where it is known
+that the encoder never reads less than some value of an open hand (`encoder.lowest`), the motor side stops there.
 
 Limits: no single fingers, no gravity along the motion, constant moment arms; the MuJoCo plant has these.
 Source of the structure: thesis section 4, "at the pulley"; of the friction form: dry_friction in motor.py.
@@ -76,6 +77,7 @@ from .ports import (
     S_CONTACT,
     S_LOAD,
     S_TIME_STEPS,
+    SENSE_POSITION,
     SLACK,
     TORQUE,
     VL,
@@ -98,8 +100,9 @@ from .ports import (
     _OBJECT_B,
     _OBJECT_AT,
     _TIP,
-) = range(N_PARAMETERS_COMMON, N_PARAMETERS_COMMON + 15)
-_N_PARAMETERS = N_PARAMETERS_COMMON + 15
+    _LOWEST,
+) = range(N_PARAMETERS_COMMON, N_PARAMETERS_COMMON + 16)
+_N_PARAMETERS = N_PARAMETERS_COMMON + 16
 
 # States of this plant, after the common ones
 _SQ, _SV, _SQL, _SVL = range(N_STATE_COMMON, N_STATE_COMMON + 4)
@@ -107,6 +110,9 @@ _N_STATES = N_STATE_COMMON + 4
 
 NO_OBJECT = 1e9
 """rad; where the object is when there is none."""
+
+NO_LOWEST = -1e9
+"""rad; the lowest reading of an encoder of which none is known."""
 
 
 def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
@@ -153,6 +159,9 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
         damped = inertia + dt * (p[_VISCOUS] + y[DAMPING])
         v = dry_friction((inertia * v + dt * (torque - load)) / damped, p[_COULOMB] + y[FRICTION], damped, dt)
         q += dt * v
+        lowest = p[_LOWEST] - p[P_ZERO] - y[SENSE_POSITION]
+        if q < lowest and q < 0.0:
+            q, v = min(lowest, 0.0), max(v, 0.0)
         s[S_TIME_STEPS] += 1.0
     s[_SQ], s[_SV], s[_SQL], s[_SVL] = q, v, ql, vl
     s[S_LOAD], s[S_CONTACT] = load, contact
@@ -197,7 +206,13 @@ _NAMES = {
     "hand.stop_stiffness": _STOP_K,
     "hand.fingertip_travel": _TIP,
 }
-_OBJECT_NAMES = {"object.stiffness": _OBJECT_K, "object.damping": _OBJECT_B, "object.position": _OBJECT_AT}
+_TRIAL_NAMES = {
+    "object.stiffness": _OBJECT_K,
+    "object.damping": _OBJECT_B,
+    "object.position": _OBJECT_AT,
+    "encoder.lowest": _LOWEST,
+}
+"""What a recording says, and no model: its object, and how little its encoder reads."""
 
 
 NEEDED = ("supply.voltage", "motor.kt", "motor.armature")
@@ -253,6 +268,7 @@ class ReducedPlant:
                 raise HannesError(f"{values.source}: {name} is 0; the reduced plant cannot move so.")
         self._update_inertia()
         self.parameters[_OBJECT_AT] = NO_OBJECT
+        self.parameters[_LOWEST] = NO_LOWEST
         if grasp is not None:
             travel = values.value("hand.fingertip_travel")
             # A fingertip travels `travel` per rad of pulley, so k at the pulley = k travel^2; contact where the
@@ -270,11 +286,11 @@ class ReducedPlant:
     @property
     def names(self) -> tuple[str, ...]:
         effects = tuple(f"{effect}.{parameter}" for effect, parameter in self.effects.index)
-        return (*_NAMES, *_OBJECT_NAMES, "motor.armature", *effects)
+        return (*_NAMES, *_TRIAL_NAMES, "motor.armature", *effects)
 
     def set(self, name: str, value: float) -> None:
-        if name in _NAMES or name in _OBJECT_NAMES:
-            self.parameters[_NAMES.get(name, _OBJECT_NAMES.get(name, 0))] = value
+        if name in _NAMES or name in _TRIAL_NAMES:
+            self.parameters[_NAMES.get(name, _TRIAL_NAMES.get(name, 0))] = value
         elif name == "motor.armature":
             self._armature = value
         elif tuple(name.split(".", 1)) in self.effects.index:
@@ -288,8 +304,8 @@ class ReducedPlant:
 
     def get(self, name: str) -> float:
         """The present value of a parameter that `set` takes."""
-        if name in _NAMES or name in _OBJECT_NAMES:
-            return float(self.parameters[_NAMES.get(name, _OBJECT_NAMES.get(name, 0))])
+        if name in _NAMES or name in _TRIAL_NAMES:
+            return float(self.parameters[_NAMES.get(name, _TRIAL_NAMES.get(name, 0))])
         if name == "motor.armature":
             return self._armature
         effect, _, parameter = name.partition(".")
