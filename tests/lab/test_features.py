@@ -75,3 +75,20 @@ def test_closures_that_an_operator_repeats_nearly_are_simulated_for_two(trial):
             left, without = (float(np.sqrt(np.mean((a - other) ** 2))) for other in (b, c))
             assert without > 1e-3 * float(np.ptp(block.measured))
             assert left < part * without
+
+
+def test_what_nobody_described_unwinds_no_farther_than_its_encoder_showed(trial):
+    """The pulley of the model runs on along a slack wire; a recording that says what made it is simulated so."""
+    model, time = Model.load(), trial.signals["encoder_position"][0]
+    shown = {"encoder_position": (time, np.maximum(trial.signals["encoder_position"][1], -0.05))}
+    strange = replace(trial, signals={**trial.signals, **shown}, options={})
+    fast = trial.reference.copy()
+    for closure in trial.closures:
+        opening = np.arange(fast.size) * trial.period > 0.5 * (closure.start + closure.stop)
+        fast[opening & (np.arange(fast.size) * trial.period < closure.stop)] = 0.0
+    lowest = {}
+    for name, one in (("described", trial), ("strange", strange)):
+        run = HandRig([one]).simulate(model, {"encoder.zero@fast": 0.02}, one, fast)
+        lowest[name] = float(run["encoder_position"].min())
+    assert lowest["described"] < -0.1
+    assert lowest["strange"] == pytest.approx(-0.05, abs=1e-6)
