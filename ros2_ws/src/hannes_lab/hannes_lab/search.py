@@ -446,8 +446,8 @@ class Search:
         """The bases with one further effect each, sorted by penalised cost.
 
         All extensions are scanned; the most promising are refitted in closed loop, the POLISH best of them with all
-        derivatives taken afresh, as far as their penalised cost is below `worth`; all of them where that leads to none
-        that is, or to one that is as far off as its base: they may be on a bent way.
+        derivatives taken afresh, as far as their penalised cost is below `worth`; all of them where their base was led
+        astray and that leads to none that is, or to one that is as far off: they may be on a bent way.
         """
         todo: dict[Names, tuple[Candidate, str]] = {}
         for base in bases:
@@ -482,15 +482,19 @@ class Search:
         worthy = [c for c in ranked[:POLISH] if c.penalised < most and c.names not in done]
         ranked = self._polished(ranked, worthy, text)
         if not self.slow and ranked and (ranked[0].pulled or ranked[0].penalised >= worth):
-            off = {key for key, (base, _) in todo.items() if base.pulled}
             done |= {c.names for c in worthy}
+            known = {key: base for key, (base, _) in todo.items()}
             bent = [
                 c
                 for c in ranked[:REFIT]
-                if c.pulled and tuple(sorted(c.names)) in off and c.names not in done
+                if c.pulled and c.names not in done and self._led_astray(known[tuple(sorted(c.names))])
             ]
             ranked = self._polished(ranked, bent, text)
         return ranked
+
+    def _led_astray(self, base: Candidate) -> bool:
+        """True where a base leaves little and is far off: what it takes over fits nearly as well as an effect would."""
+        return base.pulled and base.fit.cost <= self.problem.features.size
 
     def _polished(self, ranked: Sequence[Candidate], some: Sequence[Candidate], text: str) -> list[Candidate]:
         """The candidates, of which some are fitted with all derivatives afresh; sorted by penalised cost."""
