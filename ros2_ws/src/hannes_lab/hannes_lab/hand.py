@@ -162,6 +162,22 @@ def is_of(trial: Trial, model: Model) -> bool:
     return is_described(trial) and trial.options.get("plant", model.plant) == model.plant
 
 
+SETTLED = 0.2
+"""s in which an encoder that has come to rest does not read more than its lowest reading at rest."""
+
+
+def _lowest_at_rest(time: Array, reading: Array) -> float:
+    """The lowest reading of (n,) that was not exceeded for SETTLED: a bounce at the open stop is none."""
+    return min(
+        (
+            float(reading[k:end].max())
+            for k, end in enumerate(np.searchsorted(time, time + SETTLED))
+            if end < time.size
+        ),
+        default=float(reading.min()),
+    )
+
+
 class HandRig(PlantRig):
     """Simulates trials of the hand, on whichever plant the model names: objects, sensors and encoder zero per trial.
 
@@ -179,7 +195,7 @@ class HandRig(PlantRig):
         super().__init__(trials)
         self._sensors = {trial.name: sensors_of(trial) for trial in self.trials}
         self._lowest = {
-            trial.name: float(trial.signals["encoder_position"][1].min())
+            trial.name: _lowest_at_rest(*trial.signals["encoder_position"])
             for trial in self.trials
             if "encoder_position" in trial.signals and not is_described(trial)
         }

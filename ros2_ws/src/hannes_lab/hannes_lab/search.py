@@ -52,6 +52,11 @@ class Candidate:
         """True where a nuisance parameter is far from its nominal value."""
         return farthest(self.fit) > PULLED
 
+    @property
+    def far_off(self) -> bool:
+        """True where a verdict warns that a parameter is far outside its tolerance."""
+        return farthest(self.fit) > FAR
+
 
 REFIT = 8
 """Extensions of a round that are fitted in closed loop to the end."""
@@ -83,6 +88,9 @@ REMOVED = 0.3
 
 ALIKE = 0.5
 """Part of the gain of an approach that led to a set which explains all; approaches of less are not carried on."""
+
+FAR = 3.0
+"""Standard deviations of its prior at which a parameter of the nominal model is called far off."""
 
 PULLED = 4.0
 """Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are approached: it may
@@ -481,20 +489,20 @@ class Search:
         done = {c.names for c in ended}
         worthy = [c for c in ranked[:POLISH] if c.penalised < most and c.names not in done]
         ranked = self._polished(ranked, worthy, text)
-        if not self.slow and ranked and (ranked[0].pulled or ranked[0].penalised >= worth):
+        if not self.slow and ranked and (ranked[0].far_off or ranked[0].penalised >= worth):
             done |= {c.names for c in worthy}
             known = {key: base for key, (base, _) in todo.items()}
             bent = [
                 c
                 for c in ranked[:REFIT]
-                if c.pulled and c.names not in done and self._led_astray(known[tuple(sorted(c.names))])
+                if c.far_off and c.names not in done and self._led_astray(known[tuple(sorted(c.names))])
             ]
             ranked = self._polished(ranked, bent, text)
         return ranked
 
     def _led_astray(self, base: Candidate) -> bool:
         """True where a base leaves little and is far off: what it takes over fits nearly as well as an effect would."""
-        return base.pulled and base.fit.cost <= self.problem.features.size
+        return base.far_off and base.fit.cost <= self.problem.features.size
 
     def _polished(self, ranked: Sequence[Candidate], some: Sequence[Candidate], text: str) -> list[Candidate]:
         """The candidates, of which some are fitted with all derivatives afresh; sorted by penalised cost."""

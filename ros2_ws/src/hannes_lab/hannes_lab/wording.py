@@ -14,7 +14,7 @@ from .experiments import VISIBLE, Experiment
 from .falls import NO_REPEATS, fall_sentence
 from .fit import Fit
 from .problem import Coordinate, Problem
-from .search import PENALTY, Candidate, Search
+from .search import FAR, PENALTY, Candidate, Search
 
 ANY_DIFFERENCE = (
     "a difference of any size counts here that chance does not explain; no simple model of a real machine is that "
@@ -23,9 +23,6 @@ ANY_DIFFERENCE = (
 
 MANY_FAILURES = 0.05
 """Part of the simulations that did not stay finite from which on their parameters are worth a look."""
-
-FAR = 3.0
-"""Standard deviations of its prior at which a parameter of the nominal model is called far off."""
 
 
 def summary(
