@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.add import add_effects
 from hannes_lab.chance import chance
-from hannes_lab.choose import Choice, pruned
+from hannes_lab.choose import Choice, pruned, tie_width
 from hannes_lab.compare import compare
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Diagnosis, Fall
@@ -165,6 +166,18 @@ def test_an_effect_that_a_later_one_made_superfluous_is_dropped() -> None:
     kept = pruned(Choice(search, both, limits, True, ()))
     assert kept.best.names == ("glove_stiffness",)
     assert kept.best.penalised < both.penalised + limits.gain
+
+
+def test_where_the_model_has_an_error_of_its_own_more_ties() -> None:
+    prepared, _ = data(["glove_stiffness"], seed=102)
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, {})
+    own = (np.zeros(0, dtype=np.int64), np.zeros((0, 0)))
+    about = replace(search, problem=replace(prepared.problem, discrepancy=(own,)))
+    null = search.null()
+    for cost, width in ((100.0, 12.0), (500.0, 30.0)):
+        best = Candidate((), replace(null.fit, cost=cost), cost)
+        assert tie_width(about, best) == pytest.approx(width)
+        assert tie_width(search, best) == pytest.approx(6.0)
 
 
 def test_a_fit_from_which_nothing_of_worth_is_in_reach_ends_early_and_is_not_kept() -> None:

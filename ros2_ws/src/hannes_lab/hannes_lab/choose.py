@@ -26,7 +26,8 @@ TIE = 6.0
 wrong one beyond it in 0.7 % at worst, of sets that are as far apart as that (normal tail at the root of 6)."""
 
 OWN_ERROR_TIE = 12.0
-"""The same where the model has an error of its own."""
+TIED_PART = 0.5
+"""The same where the model has an error of its own: at least so much, and this part of what an effect must remove."""
 
 RIVAL = 2.0
 """Sets whose cost is at most so many times that of the best are judged beside it with the noise found at it."""
@@ -115,7 +116,7 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
         # On a slow plant the refit was one with all derivatives afresh.
         best = near[0] if new.slow else new.polish(near[0])
         limits_new = chance(new.problem, best.fit, new.signatures(best))
-        close = tuple(c for c in near[1:] if c.penalised <= best.penalised + tie_width(new))
+        close = tuple(c for c in near[1:] if c.penalised <= best.penalised + tie_width(new, best))
         adequate = is_adequate(new, best, limits_new)
         left = 1.0 - _share(choice.best, round_[0], choice.limits.median)
         choice = Choice(new, best, limits_new, adequate, ranking, close)
@@ -169,9 +170,11 @@ def _ended_early(size: int, left: float, best: Candidate, limits: Chance) -> str
     )
 
 
-def tie_width(search: Search) -> float:
-    """By how much the penalised costs of sets that tie may differ."""
-    return OWN_ERROR_TIE if search.problem.discrepancy else TIE
+def tie_width(search: Search, best: Candidate) -> float:
+    """By how much the penalised cost of a set that ties with the best may be larger."""
+    if not search.problem.discrepancy:
+        return TIE
+    return max(OWN_ERROR_TIE, TIED_PART * OWN_ERROR_PART * best.fit.cost)
 
 
 def needed_gain(choice: Choice, base: Candidate, *, first: bool = False) -> float:
@@ -198,7 +201,7 @@ def pruned(choice: Choice) -> Choice:
             for names, c in choice.search.found.items()
             if len(names) == len(part.names)
             and set(names) != set(part.names)
-            and c.penalised <= part.penalised + tie_width(choice.search)
+            and c.penalised <= part.penalised + tie_width(choice.search, part)
             and is_adequate(choice.search, c, choice.limits)
         ]
         choice = replace(choice, best=part, rivals=tuple(alike))
