@@ -192,6 +192,8 @@ def seen_in(trial: Trial, free: Trial) -> tuple[float, float]:
     """Place (rad) and stiffness (N/m) of the object that is seen in the first recording; there is none in the other."""
     seen, nothing = with_seen_objects([trial, free], Model.load())
     assert "object" not in nothing.options
+    assert any(f"--object {free.name}=soft" in note for note in nothing.notes)
+    assert any(f"--object {trial.name}=none" in note for note in seen.notes)
     value = Model.load().parameters.value
     grasp = seen.options["object"]
     return (value("hand.opening") - grasp["size"]) / value("hand.fingertip_travel"), grasp["stiffness"]

@@ -66,7 +66,8 @@ def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
             continue
         seen = _seen(curves[k], [c for j, c in enumerate(curves) if j != k], _nominal(model))
         if seen is None:
-            out.append(trial)
+            note = f"no grasp is seen in the closures; say --object {trial.name}=soft (or rigid) if there was one"
+            out.append(trial if given else replace(trial, notes=(*trial.notes, note)))
             continue
         stiffness, place = seen
         travel, opening = (model.parameters.value(f"hand.{n}") for n in ("fingertip_travel", "opening"))
