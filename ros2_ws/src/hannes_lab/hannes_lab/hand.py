@@ -162,20 +162,27 @@ def is_of(trial: Trial, model: Model) -> bool:
     return is_described(trial) and trial.options.get("plant", model.plant) == model.plant
 
 
+BOUNCE = 0.1
+"""s within which an encoder that bounced at the open stop of its hand is back where it rests."""
 SETTLED = 0.2
-"""s in which an encoder that has come to rest does not read more than its lowest reading at rest."""
+"""s for which it then stays there at least."""
 
 
-def _lowest_at_rest(time: Array, reading: Array) -> float:
-    """The lowest reading of (n,) that was not exceeded for SETTLED: a bounce at the open stop is none."""
-    return min(
-        (
-            float(reading[k:end].max())
-            for k, end in enumerate(np.searchsorted(time, time + SETTLED))
-            if end < time.size
-        ),
-        default=float(reading.min()),
-    )
+def _lowest_kept(time: Array, reading: Array) -> float:
+    """The lowest reading of (n,), rad; without a bounce at the open stop, where the hand is back at rest at once.
+
+    What runs on along a slack wire is away for longer, and no bounce.
+    """
+    lowest = float(reading.min())
+    early, late = (_lowest_for(time, reading, span) for span in (BOUNCE, SETTLED))
+    return late if late - early <= 0.1 * (late - lowest) else lowest
+
+
+def _lowest_for(time: Array, reading: Array, span: float) -> float:
+    """The lowest reading that was not exceeded for so many s."""
+    ends = np.searchsorted(time, time + span)
+    highest = (float(reading[k:end].max()) for k, end in enumerate(ends) if end < time.size)
+    return min(highest, default=float(reading.min()))
 
 
 class HandRig(PlantRig):
@@ -195,7 +202,7 @@ class HandRig(PlantRig):
         super().__init__(trials)
         self._sensors = {trial.name: sensors_of(trial) for trial in self.trials}
         self._lowest = {
-            trial.name: _lowest_at_rest(*trial.signals["encoder_position"])
+            trial.name: _lowest_kept(*trial.signals["encoder_position"])
             for trial in self.trials
             if "encoder_position" in trial.signals and not is_described(trial)
         }
