@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import monotonic, sleep
 
+from hannes_bringup.environment import apply_ros_environment
 from hannes_control.double_pid import DoublePID
 from hannes_control.reference import half_sine
 from hannes_description.model import Model
@@ -197,9 +198,8 @@ def main() -> None:
     parser.add_argument("--plant", default="reduced", help="reduced or mujoco")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     arguments = parser.parse_args()
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    apply_ros_environment()
     os.environ.setdefault("ROS_DOMAIN_ID", "97")
-    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
     with tempfile.TemporaryDirectory() as logs:
         os.environ["ROS_LOG_DIR"] = logs
         plant_us = in_process(arguments.plant, arguments.seconds)

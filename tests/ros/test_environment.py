@@ -1,0 +1,65 @@
+"""The middleware's settings: who hears the nodes, and that no shared memory is used."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+from graph import NodeProcess, processes
+from hannes_bringup.environment import ros_environment
+from patience import PATIENCE
+
+RANGE, PROFILES = "ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"
+
+# A node that was started without any setting of this project's, as from a terminal with ROS 2 sourced
+LISTENER = """
+    import time, rclpy
+    from std_msgs.msg import Float64
+
+    rclpy.init()
+    node, heard = rclpy.create_node("listener"), []
+    node.create_subscription(Float64, "/hannes/motor/current", heard.append, 10)
+    end = time.monotonic() + {patience}
+    while not heard and time.monotonic() < end:
+        rclpy.spin_once(node, timeout_sec=0.1)
+    print("heard" if heard else "nothing")
+"""
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, ("SYSTEM_DEFAULT", "fastdds_localhost.xml")),
+        ({"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}, ("SYSTEM_DEFAULT", "fastdds_localhost.xml")),
+        ({"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, ("LOCALHOST", "fastdds.xml")),
+        ({RANGE: "SUBNET"}, ("SUBNET", "fastdds.xml")),
+        ({PROFILES: "/mine/own.xml"}, ("LOCALHOST", "own.xml")),
+    ],
+)
+def test_nodes_stay_on_this_machine_unless_the_user_says_otherwise(
+    given: dict[str, str], expected: tuple[str, str]
+) -> None:
+    environment = ros_environment({"HOME": "/nonexistent", **given})
+    assert (environment[RANGE], Path(environment[PROFILES]).name) == expected
+    assert given.items() <= environment.items()
+    assert ros_environment(environment) == environment
+
+
+@pytest.mark.parametrize("range_", ["SUBNET", "LOCALHOST"])
+def test_heard_by_a_node_with_ros_own_settings(
+    ros_environment: dict[str, str], tmp_path: Path, range_: str
+) -> None:
+    unset = {RANGE, PROFILES, "FASTDDS_BUILTIN_TRANSPORTS"}
+    plain = {name: value for name, value in ros_environment.items() if name not in unset}
+    script = tmp_path / "listener.py"
+    script.write_text(textwrap.dedent(LISTENER.format(patience=PATIENCE)))
+    with processes(NodeProcess("hand_sim", clock="realtime")) as (sim,):
+        heard = subprocess.run(
+            [sys.executable, str(script)], env={**plain, RANGE: range_}, capture_output=True, text=True
+        )
+        assert heard.stdout.strip() == "heard", heard.stderr
+        maps = Path(f"/proc/{sim.process.pid}/maps").read_text()
+    assert "/dev/shm/fastrtps" not in maps
