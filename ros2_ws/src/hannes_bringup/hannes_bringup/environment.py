@@ -26,7 +26,7 @@ def ros_environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
     """A copy of `base` (default: this process's environment) in which ROS 2 nodes can start.
 
     AMENT_PREFIX_PATH              this Python environment, where ROS 2 came as wheels and nothing is sourced
-    ROS_AUTOMATIC_DISCOVERY_RANGE  nodes on other machines neither see nor drive the hand.  With Fast DDS that is done by
+    ROS_AUTOMATIC_DISCOVERY_RANGE  nodes on other machines neither see nor drive the hand. With Fast DDS this is done by
                                    config/fastdds_localhost.xml, which must not be overruled (SYSTEM_DEFAULT): with
                                    LOCALHOST, ROS always takes shared memory, in which a stopped process goes deaf
     FASTDDS_BUILTIN_TRANSPORTS     UDPv4, for a range that the user chose: after a kill -9 the shared memory left behind
