@@ -95,6 +95,8 @@ def test_profiles() -> None:
         np.all(ramp[900:1500] == 10.0) and np.all(ramp[2400:] == 0.0) and np.abs(np.diff(ramp)).max() < 0.02
     )
     assert np.any(np.diff(reversals()[:1500]) < 0.0), "reversals must reverse while closing"
+    first, second = np.split(reversals(closures=2, period=8.0), 2)
+    np.testing.assert_allclose(first, second, atol=1e-9, err_msg="closures of one condition must repeat it")
     with pytest.raises(HannesError, match=r"half_sine, ramp_hold, reversals"):
         make_profile("square")
     with pytest.raises(HannesError, match="amplitude"):

@@ -62,7 +62,7 @@ def reversals(
     ripple_period: float = 0.6,
     dt: float = 1e-3,
 ) -> Profile:
-    """A half sine with small reversals on top: shows slack, backlash, presliding and inertia."""
+    """A half sine with small reversals on top, in each closure alike: shows slack, backlash, presliding and inertia."""
     _check(
         closures=closures,
         amplitude=amplitude,
@@ -72,7 +72,7 @@ def reversals(
         dt=dt,
     )
     slow = half_sine(closures, 1.0, period, dt)
-    t = np.arange(slow.size) * dt
+    t = np.arange(slow.size) * dt % period
     wave = ripple * np.sin(2.0 * math.pi * t / ripple_period) * np.minimum(1.0, 4.0 * slow) * (slow > 0.0)
     return amplitude * np.clip(slow * (1.0 - ripple) + wave, 0.0, 1.0)
 

@@ -45,6 +45,7 @@ from .ports import (
     S_CURRENT,
     S_DECAY,
     S_DELAY_INDEX,
+    S_MEAN,
     S_POSITION_READ,
     S_RATE,
     S_TIME_STEPS,
@@ -119,12 +120,13 @@ def motor_torque(handle):  # type: ignore[no-untyped-def]
     kt = p[P_KT] * (1.0 + y[KT_REL])
     resistance = p[P_RESISTANCE] * (1.0 + y[RESISTANCE_REL])
     drive = x[VOLTAGE] - y[VOLTAGE_DROP] - kt * p[P_RATIO] * x[V] * (1.0 - p[P_EMF_COMPENSATED])
-    final = drive / resistance
+    final = drive * (1.0 / resistance)  # the reciprocal is known before the drive, and divisions take long
     before = s[S_CURRENT]
     rate = resistance / p[P_INDUCTANCE] * p[P_DT] if p[P_INDUCTANCE] > 0.0 else math.inf
     if rate != s[S_RATE]:
         s[S_RATE] = rate
         s[S_DECAY] = math.exp(-rate)
+        s[S_MEAN] = (1.0 - s[S_DECAY]) / rate
     decay = s[S_DECAY]
     if y[BRUSH] > 0.0:
         held = drive + decay * resistance / (1.0 - decay) * before
@@ -134,7 +136,7 @@ def motor_torque(handle):  # type: ignore[no-untyped-def]
         ) / (1.0 - decay)
     if rate < math.inf:
         after = final + (before - final) * decay
-        mean = final + (before - final) * (1.0 - decay) / rate
+        mean = final + (before - final) * s[S_MEAN]
     else:
         after = final
         mean = final
@@ -160,14 +162,15 @@ def sense(handle, q, steps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def dry_friction(v_free, level, inertia, dt):  # type: ignore[no-untyped-def]
+def dry_friction(momentum, impulse, mobility):  # type: ignore[no-untyped-def]
     """Velocity after an implicit dry-friction impulse: sticks exactly, never reverses the motion.
 
-    The proximal form of Coulomb's law (Moreau): the friction impulse is at most level x dt and opposes v.
+    The proximal form of Coulomb's law (Moreau): the friction impulse is at most `impulse` (level x dt) and opposes the
+    momentum.  mobility is one over the inertia: it is known before the momentum, and divisions take long.
     """
-    change = max(level, 0.0) * dt / inertia
-    if v_free > change:
-        return v_free - change
-    if v_free < -change:
-        return v_free + change
+    change = max(impulse, 0.0)
+    if momentum > change:
+        return (momentum - change) * mobility
+    if momentum < -change:
+        return (momentum + change) * mobility
     return 0.0

@@ -92,9 +92,10 @@ S_CONTACT = 3  # N.m of the last step
 S_POSITION_READ = 4  # rad, last encoder reading
 S_DELAY_INDEX = 5  # write position in the ring of commands
 S_RATE = (
-    6  # dt over the electrical time constant of the last step, and exp(-it): of the few things that cost time
+    6  # dt over the electrical time constant of the last step; it seldom changes, and what follows takes long
 )
-S_DECAY = 7
-N_STATE_COMMON = 8
+S_DECAY = 7  # exp(-rate)
+S_MEAN = 8  # (1 - exp(-rate)) / rate
+N_STATE_COMMON = 9
 
 DELAY_RING = 512  # commands kept; the longest delay is DELAY_RING x dt

@@ -140,13 +140,13 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
                 force -= p[_STOP_K] * (ql - p[_TRAVEL])
             inertia = p[_J_LOAD] + dt * (p[_LOAD_VISCOUS] + y[LOAD_DAMPING])
             momentum, friction = p[_J_LOAD] * vl + dt * force, p[_LOAD_COULOMB] + y[LOAD_FRICTION]
-            vl = dry_friction(momentum / inertia, friction, inertia, dt)
+            vl = dry_friction(momentum, friction * dt, 1.0 / inertia)
             depth, contact = ql - p[_OBJECT_AT], 0.0
             if depth > 0.0:
                 # It pushes back, or lets go: which of the two is known once its damping is solved with the velocity.
                 spring, damper = p[_OBJECT_K] * depth, p[_OBJECT_B] + y[OBJECT_DAMPING]
                 pressed = inertia + dt * damper
-                against = dry_friction((momentum - dt * spring) / pressed, friction, pressed, dt)
+                against = dry_friction(momentum - dt * spring, friction * dt, 1.0 / pressed)
                 contact = max(0.0, spring + damper * against)
                 if contact > 0.0:
                     vl = against
@@ -157,7 +157,8 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
 
         inertia = p[P_INERTIA] + y[INERTIA]
         damped = inertia + dt * (p[_VISCOUS] + y[DAMPING])
-        v = dry_friction((inertia * v + dt * (torque - load)) / damped, p[_COULOMB] + y[FRICTION], damped, dt)
+        friction = p[_COULOMB] + y[FRICTION]
+        v = dry_friction(inertia * v + dt * (torque - load), friction * dt, 1.0 / damped)
         q += dt * v
         lowest = p[_LOWEST] - p[P_ZERO] - y[SENSE_POSITION]
         if q < lowest and q < 0.0:
