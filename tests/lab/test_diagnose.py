@@ -13,7 +13,7 @@ from hannes_lab.add import add_effects
 from hannes_lab.chance import chance
 from hannes_lab.choose import Choice, pruned, tie_width
 from hannes_lab.compare import compare
-from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.diagnose import diagnose, effect_sources, without_idle
 from hannes_lab.diagnosis import Diagnosis, Fall
 from hannes_lab.falls import fall_sentence
 from hannes_lab.fit import Fit, fit
@@ -168,11 +168,55 @@ def test_an_effect_that_a_later_one_made_superfluous_is_dropped() -> None:
     assert kept.best.penalised < both.penalised + limits.gain
 
 
+OWN_ERROR = (np.zeros(0, dtype=np.int64), np.zeros((0, 0)))
+
+
+def test_where_the_model_has_an_error_of_its_own_an_effect_must_lower_the_error() -> None:
+    def fall(added: str, held_out: float, conditions: float | None = None) -> Fall:
+        return Fall(added, held_out, held_out, {}, (), {}, held_out if conditions is None else conditions)
+
+    prepared, _ = data(["glove_stiffness"], seed=102)
+    search = Search(
+        prepared.problem,
+        prepared.model,
+        prepared.nuisances,
+        effect_sources(only=["glove_stiffness", "gravity"]),
+    )
+    null = search.null()
+    limits = chance(search.problem, null.fit, search.signatures(null))
+    one, both = search.fitted(("glove_stiffness",)), search.fitted(("gravity", "glove_stiffness"))
+    about = replace(search, problem=replace(prepared.problem, discrepancy=(OWN_ERROR,)))
+    begin = (fall("nominal, as given", 9.0), fall("nominal, fitted", 4.0), fall("glove_stiffness", 2.0))
+    rises, drops = ((*begin, fall("gravity", error)) for error in (2.1, 1.7))
+
+    own_error = Choice(about, both, limits, True, ())
+    kept, falls = without_idle(own_error, rises)
+    assert kept.best is one and falls == begin
+    assert any("gravity would fit better" in note and "2.10 instead of 2.00" in note for note in kept.notes)
+    assert without_idle(own_error, drops) == (own_error, drops)
+    little = (*begin, fall("gravity", 1.8, 1.9))
+    assert without_idle(own_error, little)[0].best is one, "it must foretell clearly better"
+    elsewhere = (*begin, fall("gravity", 1.7, 2.3))
+    assert without_idle(own_error, elsewhere) == (own_error, elsewhere), "either will do"
+    alone = (*begin[:2], fall("glove_stiffness", 3.9, 4.1))
+    about.found[()] = Candidate((), replace(null.fit, z=np.zeros(null.fit.z.size), cost=limits.misfit), 0.0)
+    single = Choice(about, one, limits, True, ())
+    nothing, falls = without_idle(single, alone)
+    assert (
+        nothing.best.names == () and falls == begin[:2] and "3.90 instead of 4.00 on closures" in nothing.idle
+    )
+    unrepeated = (*begin[:2], fall("glove_stiffness", math.nan))
+    assert without_idle(single, unrepeated) == (single, unrepeated), "nothing was left out"
+    known = Choice(search, both, limits, True, ())
+    assert without_idle(known, rises) == (known, rises), "there the likelihood decides"
+    strict = replace(own_error, limits=replace(limits, misfit=0.9 * one.fit.cost))
+    assert without_idle(strict, rises)[0].best is both, "the rest would not explain all"
+
+
 def test_where_the_model_has_an_error_of_its_own_more_ties() -> None:
     prepared, _ = data(["glove_stiffness"], seed=102)
     search = Search(prepared.problem, prepared.model, prepared.nuisances, {})
-    own = (np.zeros(0, dtype=np.int64), np.zeros((0, 0)))
-    about = replace(search, problem=replace(prepared.problem, discrepancy=(own,)))
+    about = replace(search, problem=replace(prepared.problem, discrepancy=(OWN_ERROR,)))
     null = search.null()
     for cost, width in ((100.0, 12.0), (500.0, 30.0)):
         best = Candidate((), replace(null.fit, cost=cost), cost)
@@ -222,12 +266,16 @@ def test_a_friction_that_makes_the_hand_stick_is_fitted() -> None:
     )
     null = search.null()
     assert null.fit.z_of("hand.coulomb") > 8.0, "which has the same form, far beyond its tolerance"
-    found = search.add(null, "joint_friction")
-    assert found.fit.cost < 0.7 * null.fit.cost and found.fit.cost < 1.5 * search.problem.features.size
-    assert abs(found.fit.z_of("hand.coulomb")) < 4.0
-    assert found.fit.values["joint_friction.level"] == pytest.approx(
-        truth.effects[0].values["level"], rel=0.1
+    found = search.polish(search.add(null, "joint_friction"))
+    level = truth.effects[0].values["level"]
+    model, coordinates = search.with_effects(("joint_friction",))
+    scale = next(c.scale for c in coordinates if c.name == "joint_friction.level")
+    from_truth = fit(
+        search.problem, model, coordinates, {"joint_friction.level": level / scale}, evaluations=25
     )
+    assert found.fit.cost < 1.05 * from_truth.cost and found.fit.cost < 1.5 * search.problem.features.size
+    assert abs(found.fit.z_of("hand.coulomb")) < 4.0
+    assert found.fit.values["joint_friction.level"] == pytest.approx(level, rel=0.1)
 
 
 @pytest.mark.parametrize(("period", "phase"), [(0.6, 0.0), (4.2, 0.0), (1.1, -1.5)])

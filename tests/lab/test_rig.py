@@ -11,6 +11,7 @@ import pytest
 from hannes_bringup.cli import main
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_lab.compare import Comparison, compare
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.fit import fit
 from hannes_lab.prepare import Prepared, prepare
@@ -247,3 +248,46 @@ def test_what_moves_nothing_is_not_known(prepared: Prepared) -> None:
     assert blind.sd()[:-1] == pytest.approx(fit.sd())
     assert blind.sd()[-1] > 100.0
     assert twin.sd()[0] > 0.5 * twin.sd()[-1] > 0.3, "only their sum is known, and the prior of one"
+
+
+def test_signals_by_another_clock_than_the_reference_are_noticed_and_can_be_fitted(tmp_path: Path) -> None:
+    rng, early = np.random.default_rng(5), 3
+    write_files(tmp_path)
+    model = Model.load(tmp_path / "mass.yaml")
+    rig = load_rig(ADAPTER)
+    run = rollout(make_plant(model), rig([]).controller(model, 1e-3), reference())
+    noise = rng.standard_normal((2, run.time.size))
+    position = (run.encoder_position + 2e-7 * noise[0])[early:]
+    force = (run.motor_voltage + 0.02 * noise[1])[early:]
+    path = tmp_path / "early.npz"
+    np.savez(path, reference=run.reference_position[:-early], position=position, force=force)
+
+    def found() -> Comparison:
+        return compare(prepare(rig.read([path]), model, rig=rig), fitted=True)
+
+    before = found()
+    (note,) = (n for n in before.notes if "clock" in n)
+    assert "signals were earlier than the reference's clock says, by 3 ms" in note
+    tolerances = tmp_path / "tolerances.yaml"
+    known = tolerances.read_text()
+    tolerances.write_text(
+        known + "log.reference_delay: {sd: 0.005, closure_sd: 0.0, unit: s, source: test}\n"
+    )
+    after = found()
+    assert after.overall < 1.5 < 10.0 < before.overall and not [n for n in after.notes if "clock" in n]
+    tolerances.write_text(
+        known + 'log.reference_delay: {sd: 0.005, closure_sd: 0.0, unit: "1", source: test}\n'
+    )
+    with pytest.raises(HannesError, match="is a time in s"):
+        found()
+
+
+def test_an_error_as_small_as_the_machine_repeats_leaves_nothing_to_look_for(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a real machine chance never explains the rest; on --greedy the error on other conditions decides."""
+    sources = effect_sources(only=["gear_backlash"])
+    monkeypatch.setattr("hannes_lab.choose.AS_IT_REPEATS", 1e6)
+    found = diagnose(prepared, sources, greedy=True)
+    assert found.verdict == "nothing" and not found.effects
+    assert "error on conditions that were left out is" in found.summary and "chance" not in found.summary

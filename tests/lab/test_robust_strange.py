@@ -15,15 +15,18 @@ from hannes_lab.chance import chance
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.executor import Executor
+from hannes_lab.features import compact_end
 from hannes_lab.fit import Fit
 from hannes_lab.grasp import _seen, with_seen_objects
-from hannes_lab.hand import outer_loop
+from hannes_lab.hand import HandRig, outer_loop
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import load_trials, prepare
 from hannes_lab.problem import nuisance_coordinate
+from hannes_lab.rig import COMES_BACK
 from hannes_lab.search import Candidate, Search, wide_starts
-from hannes_lab.trials import Closure, Trial, make_trial
+from hannes_lab.trials import SAME, Closure, Trial, make_trial
 from hannes_sim.effect import load_effect, strength_of
+from hannes_sim.ports import R_QL
 from lab.foreign_bags import Signals, signals_of_set, write_set
 
 STRANGE = {
@@ -233,6 +236,27 @@ def test_a_hand_that_hits_and_stands_has_grasped_something_hard() -> None:
     )
     assert place == pytest.approx(8.8, abs=0.3)
     assert stiffness > 5e3
+
+
+def test_a_hand_that_stops_a_little_elsewhere_each_time_is_simulated_once(tmp_path: Path) -> None:
+    """Off its stop a hand sticks where the recorded reference, never the same twice, leaves it."""
+    known = Model.load()
+    rng = np.random.default_rng(5)
+
+    def never_the_same(signals: Signals) -> Signals:
+        t, v = signals["reference_position"]
+        return {**signals, "reference_position": (t, v + 1.5 + 0.005 * rng.standard_normal(v.size))}
+
+    conditions = signals_of_set(model=known, effects=[], conditions=("fast",), closures=4, seed=5)
+    (trial,) = load_trials([write_set(tmp_path / "bags", conditions, never_the_same)])
+    rig = HandRig([trial])
+    whole = rig.run(known, {}, trial, trial.reference)
+    ends = [whole.raw[round(c.stop / trial.period), R_QL] for c in trial.closures]
+    moved = abs(ends[1] - ends[0]) / trial.span
+    assert trial.apart < SAME and COMES_BACK < moved < rig.comes_back(known, trial)
+    cut = trial.reference[: compact_end(trial)]
+    assert cut.size < trial.reference.size
+    assert rig.simulate(known, {}, trial, cut)["encoder_position"].size == cut.size
 
 
 def test_another_hands_rotor_is_fitted_and_is_no_torque_constant(tmp_path: Path) -> None:

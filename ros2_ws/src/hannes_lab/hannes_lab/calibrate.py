@@ -94,7 +94,7 @@ def calibrate(
     problem = build_problem(prepared.rig, prepared.features, model, prepared.nuisances, found[0].values)
     again = Remembered(problem, _key(problem), cache, progress)
     again.done, again.total, again.text = remembered.done, remembered.total, "noise estimated anew"
-    best = fit(cast(Problem, again), model, coordinates, found[0].z, evaluations=evaluations)
+    best = fit(cast(Problem, again), model, coordinates, found[0].z, evaluations=evaluations, exact=True)
     again.text = "tolerances of what is held"
     by_held = sensitivities(again, best, held)
     parameters = identify(best, free, held, by_held)

@@ -39,6 +39,10 @@ HALF = 0.5
 """Effects that were added one after another are the answer where the error on held-out conditions, above the
 repeatability, falls to this part; where more is left, what is missing is something else."""
 
+AS_IT_REPEATS = 1.15
+"""An error on held-out conditions, in multiples of the repeatability, that leaves nothing to look for on a real
+machine: chance alone makes it 1."""
+
 MAX_EFFECTS = 3
 
 WIDE = (4, 3)
@@ -55,7 +59,10 @@ than the third will."""
 class Choice:
     """The set that was chosen, the search (with its noise) in which it was judged, and its rivals of the same size.
 
-    enough   it removes most of the error on held-out conditions, though chance does not explain the rest
+    enough   it removes most of the error on held-out conditions, or leaves no more than the machine repeats, though
+             chance does not explain the rest
+    idle     where no effect is named: a sentence on those that fit better, but foretell no better what took no part in
+             the fit
     """
 
     search: Search
@@ -66,6 +73,7 @@ class Choice:
     rivals: tuple[Candidate, ...] = ()
     notes: tuple[str, ...] = ()
     enough: bool = False
+    idle: str = ""
 
 
 def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -> Choice:
@@ -83,12 +91,10 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
         enough = is_adequate(choice.search, choice.best, choice.limits, room=1.0)
         if enough and size > 1:
             room = choice.limits.misfit - choice.limits.median
-            front = [c for c in front if c.penalised <= front[0].penalised + room]
-        elif size > 1:
-            front += choice.search.refitted(far)
+            front, far = [c for c in front if c.penalised <= front[0].penalised + room], []
         needed = needed_gain(choice, choice.best, first=size == 1)
         worth = choice.best.penalised - 0.5 * needed
-        round_ = _extended(choice.search, front, texts[size - 1], worth)
+        round_ = _extended(choice, front, far, texts[size - 1], worth)
         if not round_:
             break
         if size == 1 and _hard(choice, round_[0]):
@@ -139,13 +145,14 @@ def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects
     ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits.median)) for c in grown.first)
     notes = list(grown.notes)
     first, last = grown.errors[0], grown.errors[-1]
-    enough = bool(grown.best.names) and last - 1.0 <= HALF * (first - 1.0)
-    if enough and not adequate:
+    repeats = last <= AS_IT_REPEATS
+    enough = repeats or (bool(grown.best.names) and last - 1.0 <= HALF * (first - 1.0))
+    if enough and not adequate and not repeats:
         notes.append(
             f"the {shortfall(search, grown.best, limits)}: something smaller is left that the "
             "catalogue does not explain"
         )
-    elif grown.best.names and not adequate:
+    elif grown.best.names and not (adequate or enough):
         notes.append(
             f"what was added lowers the error on held-out conditions from {first:.3g} to {last:.3g} times the "
             "repeatability; less than half would be an answer"
@@ -196,27 +203,43 @@ def pruned(choice: Choice) -> Choice:
         gain = part.penalised + PENALTY - best.penalised
         if gain >= needed_gain(choice, part) or not is_adequate(choice.search, part, choice.limits):
             break
-        alike = [
-            c
-            for names, c in choice.search.found.items()
-            if len(names) == len(part.names)
-            and set(names) != set(part.names)
-            and c.penalised <= part.penalised + tie_width(choice.search, part)
-            and is_adequate(choice.search, c, choice.limits)
-        ]
-        choice = replace(choice, best=part, rivals=tuple(alike))
+        choice = cut_to(choice, part)
     return choice
 
 
-def _extended(search: Search, front: Sequence[Candidate], text: str, worth: float) -> list[Candidate]:
-    """The front with one further effect each, best first.
+def cut_to(choice: Choice, part: Candidate) -> Choice:
+    """The choice of a smaller set, which explains all too, with the sets of its size that do so as well."""
+    search = choice.search
+    alike = [
+        c
+        for names, c in search.found.items()
+        if len(names) == len(part.names)
+        and set(names) != set(part.names)
+        and c.penalised <= part.penalised + tie_width(search, part)
+        and is_adequate(search, c, choice.limits)
+    ]
+    return replace(choice, best=part, rivals=tuple(alike))
 
+
+def _extended(
+    choice: Choice, front: Sequence[Candidate], far: Sequence[Candidate], text: str, worth: float
+) -> list[Candidate]:
+    """The front with one further effect each, best first; and `far`, of another problem, if that does not explain all.
+
+    What ties with the best of the front is extended first, and the others if that does not explain all either.
     Where the best set holds a smaller one that was not extended, that is extended too: the other effect of a pair may
     be the right one though it was not among the best alone.
     """
-    names = list(search.sources)
-    round_ = search.extend(front, names, text, worth)
-    extended = {frozenset(c.names) for c in front}
+    search, names = choice.search, list(choice.search.sources)
+    alike = front[0].penalised + tie_width(search, front[0])
+    explained = is_adequate(search, front[0], choice.limits, room=1.0)
+    first = [c for c in front if explained or c.penalised <= alike]
+    round_, extended = search.extend(first, names, text, worth), {frozenset(c.names) for c in first}
+    if not (explained or (round_ and is_adequate(search, round_[0], choice.limits))):
+        others = [*(c for c in front if c not in first), *search.refitted(far)]
+        if others:
+            round_ = _best_of(round_, search.extend(others, names, f"{text}, from others", worth))
+            extended |= {frozenset(c.names) for c in others}
     while round_ and round_[0].penalised < worth and len(round_[0].names) > 1:
         parts = [frozenset(n for n in round_[0].names if n != one) for one in round_[0].names]
         left = [p for p in parts if p not in extended]

@@ -20,6 +20,7 @@ from .fit import fit
 from .phases import METRICS, PHASES, metrics, phase_of
 from .prepare import Prepared
 from .problem import nuisance_coordinate
+from .wording import clock_note
 
 Array = NDArray[np.float64]
 
@@ -132,11 +133,13 @@ def compare(
     values  parameters to use instead (those of a diagnosis, with its model in `prepared`)
     """
     features, model = prepared.features, prepared.model
+    own: list[str] = []
     if values is None:
         values = {}
         if fitted:
             coordinates = [nuisance_coordinate(n) for n in prepared.nuisances]
-            values = fit(prepared.problem, model, coordinates, {}, evaluations=15).values
+            found = fit(prepared.problem, model, coordinates, {}, evaluations=15)
+            values, own = found.values, clock_note(prepared.problem, found)
     predicted = features.closures(prepared.rig, model, values)
     contact = _contact(prepared, values)
     labels = [_labels(features, block, contact) for block in features.blocks]
@@ -159,7 +162,7 @@ def compare(
         _metrics(features, predicted, labels) if prepared.rig.figures else (),
         residual_dependences(features, predicted),
         data_used(features),
-        prepared.notes,
+        (*prepared.notes, *own),
     )
 
 

@@ -13,8 +13,9 @@ from hannes_description.model import EffectEntry, Model
 from hannes_sim.effect import catalogue, effect_source, load_effect
 from numpy.typing import NDArray
 
+from .adequacy import is_adequate
 from .chance import Chance, chance
-from .choose import MAX_EFFECTS, choose, choose_greedily, tied_sets
+from .choose import MAX_EFFECTS, Choice, choose, choose_greedily, cut_to, tied_sets
 from .depends import residual_dependences
 from .diagnosis import Diagnosis, Fall, FoundEffect, ParameterEstimate
 from .errors import SignalError
@@ -26,12 +27,16 @@ from .fit import Fit
 from .prepare import Prepared
 from .screen import usable_effects
 from .search import Candidate, Progress, Search, silent
-from .wording import at_end_of_range, nearest_sentence, notes, summary
+from .wording import at_end_of_range, idle_sentence, notes, summary
 
 Array = NDArray[np.float64]
 
 FITTED = "fitted by hannes"
 """Source of the nominal parameters in a model that was fitted, with effects or without."""
+
+FORETOLD = 0.25
+"""Part of the mean square error on closures or on conditions that were left out, that an effect must remove where the
+rest explains all and no model has the machine's form.  A wrong one bends the fit to its own data."""
 
 
 def effect_sources(
@@ -92,12 +97,15 @@ def diagnose(
     choice = (choose_greedily if greedy else choose)(search, null, limits, max_effects)
     search, best, limits = choice.search, choice.best, choice.limits
     prepared = replace(prepared, problem=search.problem)
-    nothing = not best.names and choice.adequate
-    verdict = "nothing" if nothing else "effects" if choice.adequate or choice.enough else "unknown"
-    tied = tied_sets(choice) if verdict == "effects" else ()
     falls = error_falls(prepared, search, best, in_order=greedy)
-    if verdict == "unknown":
+    answered = choice.adequate or choice.enough
+    if not answered:
         best, falls = worth_showing(search, best, falls)
+    elif not greedy:
+        choice, falls = without_idle(choice, falls)
+        best = choice.best
+    verdict = "unknown" if not answered else "effects" if best.names else "nothing"
+    tied = tied_sets(choice) if verdict == "effects" else ()
     best = search.with_spread(best)
     effects = found_effects(search, best, limits, falls)
     experiments = (
@@ -107,7 +115,7 @@ def diagnose(
     )
     return Diagnosis(
         verdict=verdict,
-        summary=summary(search, verdict, effects, tied, falls, limits, best, nearest_sentence(choice)),
+        summary=summary(search, verdict, effects, tied, falls, limits, choice, best),
         effects=effects,
         tied=tied,
         experiments=experiments,
@@ -119,12 +127,50 @@ def diagnose(
         chance=limits,
         costs={"nominal_fitted": null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
         nuisances=_nuisance_table(best.fit, limits),
-        notes=(*prepared.notes, *choice.notes, *notes(search, best, verdict, experiments, greedy)),
+        notes=(
+            *prepared.notes,
+            *choice.notes,
+            *notes(search, best, verdict, experiments, greedy),
+        ),
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
         model=fitted_model(prepared.model, search, best, limits),
         values=best.fit.values,
     )
+
+
+def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple[Fall, ...]]:
+    """Without the effects that foretell no better what took no part in the fit, where those before them explain all.
+
+    Only where the recordings are of another machine than the simulator's: there a better fit alone is no reason for an
+    effect, since the form of the model is wrong anyway.
+    """
+    rig = choice.search.problem.rig
+    keep = len(falls) - 2
+    while keep and not _foretells(falls[1 : keep + 2]):
+        keep -= 1
+    if keep == len(choice.best.names) or not (rig.foreign or choice.search.problem.discrepancy):
+        return choice, falls
+    part = choice.search.found[tuple(sorted(fall.added for fall in falls[2 : keep + 2]))]
+    if not is_adequate(choice.search, part, choice.limits):
+        return choice, falls
+    fewer = falls[: keep + 2]
+    idle = idle_sentence(choice.best, part, falls[-1], fewer[-1])
+    cut = cut_to(choice, part)
+    return replace(cut, notes=(*cut.notes, idle)) if part.names else replace(cut, idle=idle), fewer
+
+
+def _foretells(falls: Sequence[Fall]) -> bool:
+    """Whether the last of the sets has clearly less error than each before on closures or conditions left out.
+
+    On either: what a condition has of its own, like an object, cannot be foretold from the others.
+    """
+    known = [
+        errors
+        for errors in ([f.held_out for f in falls], [f.held_out_conditions for f in falls])
+        if np.isfinite(errors).all()
+    ]
+    return not known or any(e[-1] ** 2 <= (1.0 - FORETOLD) * min(e[:-1]) ** 2 for e in known)
 
 
 def fitted_model(model: Model, search: Search, best: Candidate, limits: Chance) -> Model:

@@ -16,7 +16,7 @@ from .problem import Coordinate, nuisance_coordinate
 from .rig import Rig
 from .search import Candidate, Search
 from .surrogate import FAST_PLANT, SLOW_PLANTS
-from .trials import Trial
+from .trials import Closure, Trial
 
 Array = NDArray[np.float64]
 Loose = tuple[Coordinate, float, float]
@@ -122,7 +122,9 @@ def _noise(prepared: Prepared) -> dict[str, float]:
 def _trial(like: Trial, name: str, profile: str, options: dict[str, float], grasp: str) -> Trial:
     reference = make_profile(profile, closures=2, dt=like.period, **options)
     meta = {**like.options, "object": grasp}
-    return Trial(name, like.period, reference, like.signals, like.closures, meta)
+    ends = [k * options["period"] for k in range(3)]
+    closures = tuple(Closure(a, b, name) for a, b in itertools.pairwise(ends))
+    return Trial(name, like.period, reference, like.signals, closures, meta)
 
 
 def _open(rig: Rig, candidate: Candidate) -> list[Loose]:

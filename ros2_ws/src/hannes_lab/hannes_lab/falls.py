@@ -93,7 +93,7 @@ def _problem_builder(search: Search, rig: Rig, values: Mapping[str, float]) -> A
 def worth_showing(
     search: Search, best: Candidate, falls: tuple[Fall, ...]
 ) -> tuple[Candidate, tuple[Fall, ...]]:
-    """Where something unknown is left, only those effects that lower the error on held-out closures are shown."""
+    """The effects up to that with which the error on held-out closures is least: what follows only fits better."""
     errors = [fall.held_out for fall in falls[1:]]
     if not np.isfinite(errors).any():
         return best, falls

@@ -21,6 +21,7 @@ from hannes_sim.effect import load_effect
 from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
+from .repeats import end_of
 from .rig import Rig
 from .trials import SAME, Trial
 
@@ -318,7 +319,7 @@ def compact_end(trial: Trial, most: float = NEARLY) -> int | None:
         return None
     if trial.apart > most:
         return None
-    return min(trial.reference.size, round(trial.closures[max(repeats)].stop / trial.period) + 60)
+    return end_of(trial, max(repeats) + 1)
 
 
 def stands_for_all(trial: Trial) -> bool:

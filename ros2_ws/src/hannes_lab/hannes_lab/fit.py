@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -174,6 +174,17 @@ def over_its_spread(problem: Problem, found: Fit) -> Fit:
     return found
 
 
+KEPT = 0.6
+MISSED = 0.02
+"""Derivatives are taken anew after a step that lowered the cost by less than this part of what they promised, or that
+missed the residual that they promised by this part of its squares: far from the end, what was learned in one place
+leads astray in the next."""
+
+LEAST_GAIN = 0.1
+LITTLE_GAIN = 1e-3
+"""By how much a fit must lower its cost after its derivatives were found, or it ends: a small part of the likelihood's
+own width, or this part of what noise does not explain."""
+
 PATIENCE = 3.0
 """A search that is not worth it ends where so many more falls like the last one, of what it promises, would not do."""
 
@@ -181,6 +192,77 @@ PATIENCE = 3.0
 OFF_BOUND = 0.02
 """Standard deviations from its bound at which a nuisance parameter starts: on the bound the first dozen steps would all
 be cut short by it."""
+
+
+class Derivatives:
+    """Derivatives (size, k) of the whitened residual along the way of a fit.
+
+    By finite differences where the fit starts, and again after a step that led elsewhere than they promised.  Between,
+    each step teaches them what they missed (Broyden 1965), shared among the coordinates by how far they moved the data.
+
+    known   derivatives by coordinate name with which to begin; these are only taught
+    steps   of the finite differences, by coordinate name
+    cost    of a whitened residual (size,) at a point z (k,)
+    most    derivatives that are taken by finite differences at most, but for the first ones
+    taken   how many were
+    fresh   True where none was taught since
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        model: Model,
+        coordinates: Sequence[Coordinate],
+        known: Mapping[str, Array],
+        steps: Mapping[str, float],
+        cost: Callable[[Array, Array], float],
+        most: int,
+    ) -> None:
+        self.problem, self.model, self.coordinates = problem, model, coordinates
+        self.steps, self.cost, self.most = dict(steps), cost, most
+        self.unknown = [j for j, c in enumerate(coordinates) if c.name not in known]
+        self.jacobian = np.column_stack(
+            [known.get(c.name, np.zeros(problem.features.size)) for c in coordinates]
+        )
+        self.z, self.residual = np.zeros(0), np.zeros(0)
+        self.fresh, self.taken = False, 0
+
+    def forget(self) -> None:
+        """Take those that are not known by finite differences next time."""
+        self.z = np.zeros(0)
+
+    def at(self, z: Array, residual: Array) -> Array:
+        """The derivatives at a point z (k,), with the residual (size,) there."""
+        move = z - self.z if self.z.size else None
+        if move is None or not self._promised(move, z, residual):
+            self.taken += len(self.unknown)
+            self.jacobian = self.jacobian.copy()
+            self.jacobian[:, self.unknown] = finite_differences(
+                self.problem, self.model, self.coordinates, z, residual, self.unknown, self.steps
+            )
+            self.fresh = True
+        elif move.any():
+            change = residual - self.residual
+            weights = (self.jacobian**2).sum(axis=0)
+            whole = float(weights @ move**2)
+            # What a short step missed is the simulation's roughness.
+            if whole > 0.0 and np.linalg.norm(change) > ROUGHNESS:
+                missed = change - self.jacobian @ move
+                self.jacobian = self.jacobian + np.outer(missed, weights * move / whole)
+            self.fresh = False
+        self.z, self.residual = z.copy(), residual
+        return self.jacobian
+
+    def _promised(self, move: Array, z: Array, residual: Array) -> bool:
+        """Whether a step led about where the derivatives promised, or none may be taken any more."""
+        if not self.unknown or self.taken + len(self.unknown) > self.most:
+            return True
+        promised = self.residual + self.jacobian @ move
+        was, made, hoped = (
+            self.cost(r, at) for r, at in ((self.residual, self.z), (residual, z), (promised, z))
+        )
+        missed = self.cost(residual - promised, np.zeros(z.size))
+        return was - made >= KEPT * (was - hoped) and missed <= MISSED * made
 
 
 class _NotWorth(Exception):
@@ -205,15 +287,19 @@ def fit(
     known: Mapping[str, Array] | None = None,
     steps: Mapping[str, float] | None = None,
     evaluations: int = 12,
+    little: float = LITTLE_GAIN,
+    exact: bool = False,
     worth: float = np.inf,
 ) -> Fit:
     """Least squares over z from `start` (z by name, others 0).
 
     rows         features that take part; None: all
-    known        derivatives (size,) by coordinate name that are taken as constant (those of nuisance parameters hardly
-                 change); the others are found by finite differences at every step
+    known        derivatives (size,) by coordinate name with which to begin; the others are found by finite differences,
+                 see Derivatives
     steps        of the finite differences, see there
-    evaluations  limit on the steps of the trust-region search (scipy's trf)
+    evaluations  limit on the simulations, in those of a step for which all derivatives are found
+    little       see LITTLE_GAIN
+    exact        the derivatives at the end are found by finite differences there, for intervals
     worth        a search ends early where the straight lines lead to no cost below this, have little left to gain, and
                  promise much the same as a step ago
     """
@@ -239,32 +325,19 @@ def fit(
             )
         return cache[key]
 
-    last: dict[str, Array] = {}
-    steps = dict(steps or {})
-
-    def jacobian_at(z: Array) -> Array:
-        r = residual_at(z)
-        full = np.empty((r.size, len(coordinates)))
-        todo = []
-        for j, c in enumerate(coordinates):
-            if c.name in known:
-                full[:, j] = known[c.name]
-            else:
-                todo.append(j)
-        full[:, todo] = finite_differences(problem, model, coordinates, z, r, todo, steps)
-        last["jacobian"] = full
-        last["z"] = z.copy()
-        return full
-
     def cost(r: Array, z: Array) -> float:
-        return float(r @ r + (priors * z) @ (priors * z))
+        return float(r[use] @ r[use] + (priors * z) @ (priors * z))
+
+    most = evaluations * (1 + sum(c.name not in known for c in coordinates))
+    derivatives = Derivatives(problem, model, coordinates, known, steps or {}, cost, most)
 
     promised: list[float] = []
 
     def search_direction(z: Array) -> Array:
-        jacobian, r = jacobian_at(z)[use], residual_at(z)[use]
+        r = residual_at(z)
+        jacobian = derivatives.at(z, r)[use]
         if worth < np.inf:
-            promised.append(linear_minimum(jacobian, r, z, priors)[0])
+            promised.append(linear_minimum(jacobian, r[use], z, priors)[0])
             short = promised[-1] - worth
             to_gain = cost(r, z) - promised[-1]
             if len(promised) > 1 and short > max(to_gain, PATIENCE * abs(promised[-2] - promised[-1])):
@@ -276,22 +349,34 @@ def fit(
         return Fit(model, (), np.zeros(0), float(r[use] @ r[use]), r, np.zeros((r.size, 0)))
     edge = np.where(priors > 0.0, OFF_BOUND, 1e-9)
     inside = np.clip(z0, bounds[0] + edge, bounds[1] - edge)
-    complete = True
+    z, complete, simulated, samples = inside, True, 0, int(np.count_nonzero(use))
     try:
-        z = least_squares(
-            lambda z: np.concatenate([residual_at(z)[use], priors * z]),
-            inside,
-            jac=search_direction,
-            bounds=(bounds[0], bounds[1]),
-            method="trf",
-            max_nfev=evaluations,
-            ftol=1e-5,
-            xtol=1e-5,
-            gtol=1e-8,
-            x_scale=1.0,
-        ).x
+        while True:
+            found = least_squares(
+                lambda z: np.concatenate([residual_at(z)[use], priors * z]),
+                z,
+                jac=search_direction,
+                bounds=(bounds[0], bounds[1]),
+                method="trf",
+                max_nfev=max(1, most - derivatives.taken - simulated),
+                ftol=1e-5,
+                xtol=1e-5,
+                gtol=1e-8,
+                x_scale=1.0,
+            )
+            gain = cost(residual_at(z), z) - 2.0 * found.cost
+            z, simulated = found.x, simulated + found.nfev
+            if (
+                simulated + derivatives.taken >= most
+                or derivatives.fresh
+                or gain < max(LEAST_GAIN, little * (2.0 * found.cost - samples))
+            ):
+                break
+            derivatives.forget()
     except _NotWorth:
-        z, complete = last["z"], False
+        z, complete = derivatives.z, False
     r = residual_at(z)
-    jacobian = last["jacobian"] if "z" in last and np.allclose(last["z"], z, atol=0.2) else jacobian_at(z)
-    return Fit(model, coordinates, z, cost(r[use], z), r, jacobian, complete)
+    if exact and not derivatives.fresh:
+        derivatives.forget()
+    jacobian = derivatives.at(z, r)
+    return Fit(model, coordinates, z, cost(r, z), r, jacobian, complete)

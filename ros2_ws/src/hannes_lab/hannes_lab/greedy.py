@@ -105,7 +105,7 @@ def _judge(search: Search, candidates: Sequence[Candidate], text: str) -> _Judge
     if not alike:
         return _Judged(judged[0], float("nan"), ())
     for candidate in judged:
-        search.found[tuple(sorted(candidate.names))] = candidate
+        search.found[candidate.key] = candidate
     winner = min(alike, key=lambda k: (len(judged[k].fit.coordinates), held[k]))
     rivals = tuple(judged[k] for k in sorted(alike, key=lambda k: held[k]) if k != winner)
     error = search.once(held_out_error, judged[winner], text=f"{text}: held-out conditions")

@@ -18,9 +18,9 @@ from hannes_sim.measurement import Sensors, folded_mean, logger, sample_noise
 from hannes_sim.objects import GraspObject, named_object
 from hannes_sim.plant import Plant
 from hannes_sim.rollout import Rollout, step_of
-from numba import njit
 from numpy.typing import NDArray
 
+from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD, moved, moving_mean
 from .features import FINEST, Block
 from .rig import Nuisance, PlantRig, make_controller
 from .trials import Trial
@@ -85,11 +85,6 @@ _APART = 4.0
 """Standard deviations from the mean over the recordings: one hand whose open position, or clock, is elsewhere in each
 recording is no explanation, however well it fits."""
 
-REFERENCE_DELAY = "log.reference_delay"
-REFERENCE_DELAY_SD = 0.02
-"""s; how far the log's clock of the reference may be from that of the encoder: latencies, a reference that was logged
-after or before it was filtered."""
-
 CURRENT_WINDOW = "log.current_window"
 
 OWN_ERROR: Mapping[str, float] = {"encoder_position": 0.0022}
@@ -106,7 +101,6 @@ REFERENCE_LEAD = "log.reference_lead"
 LEAD_SEEN = 0.02
 """s; a reference that seems so early is one whose rate the controller sees too (a derivative of the error)."""
 
-_RATE_OVER = 0.01
 _SMOOTHED = 0.03
 """s; a reference that comes by messages has a rate only over one or several of them."""
 
@@ -166,6 +160,8 @@ BOUNCE = 0.1
 """s within which an encoder that bounced at the open stop of its hand is back where it rests."""
 SETTLED = 0.2
 """s for which it then stays there at least."""
+ALREADY_BACK = 0.1
+"""Part of the bounce's depth that it may still be off then."""
 
 
 def _lowest_kept(time: Array, reading: Array) -> float:
@@ -175,14 +171,17 @@ def _lowest_kept(time: Array, reading: Array) -> float:
     """
     lowest = float(reading.min())
     early, late = (_lowest_for(time, reading, span) for span in (BOUNCE, SETTLED))
-    return late if late - early <= 0.1 * (late - lowest) else lowest
+    return late if late - early <= ALREADY_BACK * (late - lowest) else lowest
 
 
 def _lowest_for(time: Array, reading: Array, span: float) -> float:
     """The lowest reading that was not exceeded for so many s."""
     ends = np.searchsorted(time, time + span)
-    highest = (float(reading[k:end].max()) for k, end in enumerate(ends) if end < time.size)
-    return min(highest, default=float(reading.min()))
+    begins = np.flatnonzero(ends < time.size)
+    if not begins.size:
+        return float(reading.min())
+    pairs = np.column_stack([begins, ends[begins]]).ravel()
+    return float(np.maximum.reduceat(reading, pairs)[::2].min())
 
 
 class HandRig(PlantRig):
@@ -196,6 +195,7 @@ class HandRig(PlantRig):
     phases: Mapping[str, str] = {}
     machine = "hand"
     figures = True
+    foreign = False  # what does not describe itself has an error of the model's own
     experiments = True
 
     def __init__(self, trials: Sequence[Trial]) -> None:
@@ -318,6 +318,11 @@ class HandRig(PlantRig):
         sd[resting] *= AT_REST
         return sd
 
+    def comes_back(self, model: Model, trial: Trial) -> float:
+        """See PlantRig; of another machine the model's position is known no better than its own error says."""
+        known = super().comes_back(model, trial)
+        return known if is_of(trial, model) else max(known, OWN_ERROR["encoder_position"])
+
     def plant(self, model: Model, trial: Trial) -> Plant:
         """The plant with the trial's object, encoder quantiser off."""
         plant = make_plant(model, object_of(trial), dt=step_of(trial.period))
@@ -353,7 +358,7 @@ class HandRig(PlantRig):
             of_plant[LOWEST] = self._lowest[trial.name]
         if isinstance(controller, DoublePID):
             controller.parameters[:] = replace(controller.settings, **gains).to_array()
-        return self._run(model, of_plant, trial, _moved(reference, delay, lead, trial), before)
+        return self._run(model, of_plant, trial, moved(reference, delay, lead, trial), before)
 
     def observed(
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
@@ -370,7 +375,7 @@ class HandRig(PlantRig):
                 run.motor_current, trial.period, rectified=logged["rectified"], window=logged["window"]
             )
         else:
-            current = _moving_mean(
+            current = moving_mean(
                 np.abs(run.motor_current) if logged["rectified"] else run.motor_current, window / trial.period
             )
         if logged["rectified"]:
@@ -450,53 +455,3 @@ def _linear_law(rows: Array) -> tuple[Array, float]:
     known, wanted = rows[:, :-1], rows[:, -1]
     solution, *_ = np.linalg.lstsq(known, wanted, rcond=None)
     return np.asarray(solution), float(np.linalg.norm(wanted - known @ solution))
-
-
-def _moved(reference: Array, delay: float, lead: float, trial: Trial) -> Array:
-    """The reference later by `delay` [s] and with `lead` [s] times its rate; a cut one goes on as the trial's."""
-    if delay == 0.0 and lead == 0.0:
-        return reference
-    n = reference.size
-    whole = trial.reference if np.array_equal(trial.reference[:n], reference) else reference
-    if lead != 0.0:
-        whole = whole + lead * np.gradient(_moving_mean(whole, _RATE_OVER / trial.period), trial.period)
-    moved: Array = _later(np.ascontiguousarray(whole), delay / trial.period, n)
-    return moved
-
-
-@njit(cache=True, nogil=True)
-def _at_tick(values, at):  # type: ignore[no-untyped-def]
-    """Linear interpolation of values (n,) at a place in ticks; beyond the ends, the end."""
-    if at <= 0.0:
-        return values[0]
-    if at >= values.size - 1:
-        return values[-1]
-    k = int(at)
-    return values[k] + (at - k) * (values[k + 1] - values[k])
-
-
-@njit(cache=True, nogil=True)
-def _later(values, ticks, n):  # type: ignore[no-untyped-def]
-    """The first n values, later by `ticks`."""
-    out = np.empty(n)
-    for k in range(n):
-        out[k] = _at_tick(values, k - ticks)
-    return out
-
-
-def _moving_mean(values: Array, width: float) -> Array:
-    """Mean over the trailing `width` ticks; unlike `logger`, continuous in the width."""
-    mean: Array = _trailing_mean(np.ascontiguousarray(values), max(width, 1.0))
-    return mean
-
-
-@njit(cache=True, nogil=True)
-def _trailing_mean(values, width):  # type: ignore[no-untyped-def]
-    total = np.zeros(values.size + 1)
-    for k in range(values.size):
-        total[k + 1] = total[k] + values[k]
-    out = np.empty(values.size)
-    for k in range(values.size):
-        begin = max(k + 1 - width, 0.0)
-        out[k] = (total[k + 1] - _at_tick(total, begin)) / (k + 1 - begin)
-    return out

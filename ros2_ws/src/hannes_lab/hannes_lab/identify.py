@@ -195,9 +195,11 @@ def search(
         if announce is not None:
             announce(k, starts)
         z = begin if k == 0 else begin + SPREAD * np.clip(rng.standard_normal(len(coordinates)), -1.5, 1.5)
-        best = fit(cast(Problem, problem), model, coordinates, z, evaluations=evaluations)
+        best = fit(cast(Problem, problem), model, coordinates, z, evaluations=evaluations, exact=True)
         for _ in range(RESTARTS):
-            again = fit(cast(Problem, problem), model, coordinates, best.z, evaluations=evaluations)
+            again = fit(
+                cast(Problem, problem), model, coordinates, best.z, evaluations=evaluations, exact=True
+            )
             gain = best.cost - again.cost
             best = min(best, again, key=lambda f: f.cost)
             if gain < _close(best.cost):

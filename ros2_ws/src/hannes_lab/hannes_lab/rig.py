@@ -24,10 +24,11 @@ from hannes_sim import reduced
 from hannes_sim.effect import EffectType, call_own, catalogue, load_class
 from hannes_sim.factory import make_plant
 from hannes_sim.plant import Plant
-from hannes_sim.ports import R_Q, R_QL
 from hannes_sim.rollout import Controller, Rollout, rollout, step_of
 from numpy.typing import NDArray
 
+from .clock import REFERENCE_DELAY, moved
+from .repeats import FEW, came_back, end_of, few_will_do, repeated
 from .trials import SAME, Trial
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ class Rig(Protocol):
     pooled    True: in a fit every sample of a signal counts the same, and the fit is of least square error.  For
               machines that repeat far better than any model will fit; the exact moments would rule the fit otherwise
     approximate  True where a plant is seen through another one: how the first closure differs is not seen well then
+    foreign      True where the recordings are of another machine than the simulator's, so that no model has its form
     """
 
     trials: tuple[Trial, ...]
@@ -113,6 +115,7 @@ class Rig(Protocol):
     drive_signals: tuple[str, ...]
     pooled: bool
     approximate: bool
+    foreign: bool
     figures: bool
     phases: Mapping[str, str]
     machine: str
@@ -159,7 +162,7 @@ class PlantRig:
                  from REFERENCE_SIZES; effects are scaled by them
     linear       True where position is in m and the drive gives N: units are named so
     without      effects that have no meaning here, with the reason
-    floor, points, drive_signals, pooled, approximate, phases, machine, figures, experiments  see Rig
+    floor, points, drive_signals, pooled, approximate, foreign, phases, machine, figures, experiments  see Rig
 
     Plants are built once per (model structure, trial) and then only re-parametrised.
     """
@@ -174,6 +177,7 @@ class PlantRig:
     drive_signals: tuple[str, ...] = ("motor_current", "motor_effort")
     pooled: bool = False
     approximate: bool = False
+    foreign: bool = True
     phases: Mapping[str, str] = {"void": "forward", "opening": "back"}
     machine: str = "machine"
     figures: bool = False
@@ -222,6 +226,10 @@ class PlantRig:
             raise HannesError(
                 f"{self.population}: '{name}' needs the numbers sd and closure_sd, and a unit ({error})."
             ) from error
+        if name == REFERENCE_DELAY:
+            if str(entry["unit"]) != "s":
+                raise HannesError(f"{self.population}: '{name}' is a time in s, not in {entry['unit']!r}.")
+            return Nuisance(name, 0.0, sd, False, scatter, "s")
         unit, mean = model.parameters[name].unit, model.parameters.value(name)
         if relative and sd <= NARROW and mean > 0.0:
             return Nuisance(name, mean, sd * mean, False, scatter * mean, unit, lower=LEAST * mean)
@@ -237,6 +245,13 @@ class PlantRig:
             return kind
         sizes = tuple(sorted(self.sizes.items()))
         return scaled_effect(kind, sizes, self.linear)  # type: ignore[arg-type]  # a class is hashable
+
+    def comes_back(self, model: Model, trial: Trial) -> float:
+        """Part of the reference's span within which a closure ends where the one before it did, if all repeat it.
+
+        Where closures repeat each other only nearly, their ends differ too.
+        """
+        return COMES_BACK + (trial.apart if trial.apart > SAME else 0.0)
 
     def controller(self, model: Model, period: float) -> Controller:
         """The control law in the loop."""
@@ -275,11 +290,20 @@ class PlantRig:
             self._came_back = True
             signals = self.observed(model, values, trial, reference)
             if not (self._came_back or trial.anew) and reference.size < trial.reference.size:
-                signals = self.observed(model, values, trial, trial.reference)
+                signals = self._longer(model, values, trial)
             self._signals[key] = signals
             if len(self._signals) > REMEMBERED:
                 self._signals.popitem(last=False)
         return self._signals[key]
+
+    def _longer(self, model: Model, values: Mapping[str, float], trial: Trial) -> dict[str, Array]:
+        """Signals of the whole trial, where the second closure does not end as the first did."""
+        if few_will_do(trial):
+            self._came_back = True
+            signals = self.observed(model, values, trial, trial.reference[: end_of(trial, FEW)])
+            if self._came_back:
+                return repeated(signals, trial)
+        return self.observed(model, values, trial, trial.reference)
 
     def observed(
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
@@ -306,6 +330,7 @@ class PlantRig:
         """The rollout from reset, or from where the reference `before` leads."""
         plant, controller, base = self._plant(model, trial)
         wanted = _wanted(model, values, trial)
+        reference = moved(reference, wanted.pop(REFERENCE_DELAY, 0.0), 0.0, trial)
         for name in set(base) - set(wanted):
             plant.set(name, base[name])
         for name, value in wanted.items():
@@ -315,7 +340,7 @@ class PlantRig:
         if before is not None:
             rollout(plant, controller, before, joints=False)
         done = rollout(plant, controller, reference, reset=before is None, joints=False)
-        self._came_back = _came_back(done, trial)
+        self._came_back = came_back(done, trial, self.comes_back(model, trial))
         return done
 
     def _key(self, model: Model, trial: Trial) -> tuple[str, ...]:
@@ -334,20 +359,6 @@ class PlantRig:
             _check_law(law, trial.period, f"The control law '{model.controller}'")
             self._plants[key] = (plant, law, {})
         return self._plants[key]
-
-
-def _came_back(run: Rollout, trial: Trial) -> bool:
-    """Whether the second closure ends where the first did, on both sides of the wire: then all repeat it.
-
-    A hand whose joints stick stays where they stop, a little further with each closure, which the encoder hardly shows.
-    Where closures repeat each other only nearly, their ends differ too.
-    """
-    ends = [round(closure.stop / trial.period) for closure in trial.closures[:2]]
-    if len(ends) < 2 or ends[1] >= run.raw.shape[0]:
-        return True
-    here, there = run.raw[ends[0], [R_Q, R_QL]], run.raw[ends[1], [R_Q, R_QL]]
-    most = COMES_BACK + (trial.apart if trial.apart > SAME else 0.0)
-    return bool(np.abs(here - there).max() <= most * trial.span)
 
 
 def _wanted(model: Model, values: Mapping[str, float], trial: Trial) -> dict[str, float]:

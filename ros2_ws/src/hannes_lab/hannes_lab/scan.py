@@ -101,14 +101,16 @@ class Scan:
         all_pits = off and not isinstance(self.problem.rig, AnchoredRig)
         lines = spectral_periods(kind, seen_from(self.problem, base), base)
         shapes = shapes_of(kind, (*lines, *tried_periods(kind, self.problem.features)))
+        period = period_of(kind)
         for place in places:
             scan = _Place(self, kind, place, model, coordinates)
-            if period_of(kind):
+            if period:
                 best += scan.rippled(shapes)[: PITS if all_pits else RIPPLES]
             else:
                 every = scan.scored(shapes, _strengths(kind), last=place is places[-1])
                 best.append(min(every, key=lambda item: item[0]))
-        return sorted(best, key=lambda item: item[0])
+        best.sort(key=lambda item: item[0])
+        return _distinct(best, f"{kind.name}.{period.name}")[:PITS] if period else best
 
     def nearer(self, start: Mapping[str, float], base: Fit) -> Fit:
         """Where a fit from a start looks from: the base, another minimum of it, or its nominal nuisance parameters,
@@ -250,6 +252,11 @@ class _Place:
             low, high = self.coordinates[k].bounds
             out[self.coordinates[k].name] = float(np.clip(s, low, high))
         return cost, out
+
+
+def _distinct(scored: Sequence[Scored], shape: str) -> list[Scored]:
+    """Of the points with the same value of a shape only the first one."""
+    return list({point[shape]: (cost, point) for cost, point in reversed(scored)}.values())[::-1]
 
 
 def period_of(kind: EffectType) -> EffectParameter | None:

@@ -48,6 +48,11 @@ class Candidate:
     penalised: float
 
     @property
+    def key(self) -> Names:
+        """Its names, whatever the order in which they were found: as sets of effects are kept."""
+        return tuple(sorted(self.names))
+
+    @property
     def pulled(self) -> bool:
         """True where a nuisance parameter is far from its nominal value."""
         return farthest(self.fit) > PULLED
@@ -62,10 +67,17 @@ REFIT = 8
 """Extensions of a round that are fitted in closed loop to the end."""
 
 SHORT = 4
+MIDDLE = 5
 LONG = 10
 WHOLE = 25
-"""Steps of a fit in closed loop: where more than REFIT extensions are to be told apart, of the others, and of the model
-as it is."""
+"""Length of a fit in closed loop (see fit): where more than REFIT extensions are to be told apart, without known
+derivatives and with them, of the others, and of the model as it is."""
+
+ROUGH = 0.01
+"""Part of its cost by which an approach must be lowered to go on; the best of them are fitted to the end."""
+
+AFRESH = 2
+"""Starts of an effect that a thorough search follows."""
 
 STARTS = 4
 APART = 1.5
@@ -113,7 +125,7 @@ class Search:
 
     sources     effect name -> what load_effect takes (catalogue name or path.py:Class)
     before      the model as it is, fitted with the noise that was estimated before; where its fit starts from
-    thorough    a first effect is approached from the nominal values afresh, and given up later
+    thorough    a first effect is approached from the nominal values afresh
     """
 
     problem: Problem
@@ -215,13 +227,12 @@ class Search:
         """Fits of the base set plus one effect from each start, best first; a slow plant runs at their ends only.
 
         worth   penalised cost below which the set is of interest
-        short   a few steps only, with all derivatives of the base taken as constant; in a thorough search, of the model
-                as it is, from the nominal values afresh, and none ends early: where nuisance parameters have taken over
-                the effect, what straight lines promise says little
+        short   a few steps only, with all derivatives of the base known
         """
+        if self.thorough and not base.names:
+            return self._afresh(base, name, starts)
         model, coordinates = self.with_effects((*base.names, name))
-        first = short and self.thorough and not base.names
-        worth = np.inf if first else worth - _penalty(coordinates)
+        worth -= _penalty(coordinates)
         found = []
         for start in starts:
             near = self.scan.nearer(start, base.fit)
@@ -238,19 +249,12 @@ class Search:
                 # Costs that were seen from different places cannot be compared before the anchor is there.
                 found.append(at_anchor(self.problem, one, self.rows)[1])
                 continue
-            ways: list[tuple[Fit | None, Mapping[str, float]]] = [(near, at)]
+            ways = [(near, at)]
             if near is not base.fit:
                 # Where the effect makes the hand stick, the linear moves of the scan lead astray, and so may either
                 # point's derivatives.
-                still = {c.name: at.get(c.name, 0.0) for c in coordinates if not c.prior}
-                still |= {c.name: near.point[c.name] for c in near.coordinates if c.prior}
-                # From far off the way is long, and bends: the model as it is has gone another one.
-                afresh = first and near is self.scan.at_nominal(base.fit)
-                ways += [(base.fit, at), (None if afresh else near, still)]
+                ways += [(base.fit, at), (near, _still(coordinates, at, near))]
             for point, begin in ways:
-                known = (
-                    _derivatives(point, [c for c in point.coordinates if short or c.prior]) if point else {}
-                )
                 found.append(
                     fit(
                         self.problem,
@@ -258,11 +262,35 @@ class Search:
                         coordinates,
                         begin,
                         rows=self.rows,
-                        known=known,
-                        evaluations=SHORT if short and point else LONG,
+                        known=_derivatives(point, [c for c in point.coordinates if short or c.prior]),
+                        evaluations=SHORT if short else LONG,
+                        little=ROUGH,
                         worth=worth,
                     )
                 )
+        return sorted(found, key=lambda f: f.cost)
+
+    def _afresh(self, base: Candidate, name: str, starts: Sequence[Mapping[str, float]]) -> list[Fit]:
+        """Fits of the model as it is plus one effect from its nominal values, best first.
+
+        Where nuisance parameters have taken over the effect, the way back is long and bends, and what straight lines
+        promise says little: all derivatives are found there, and no fit ends early.
+        """
+        model, coordinates = self.with_effects((name,))
+        nominal = self.scan.at_nominal(base.fit)
+        near = [start for start in starts if self.scan.nearer(start, base.fit) is nominal] or starts
+        found = [
+            fit(
+                self.problem,
+                model,
+                coordinates,
+                _still(coordinates, start, nominal),
+                rows=self.rows,
+                evaluations=MIDDLE,
+                little=ROUGH,
+            )
+            for start in near[:AFRESH]
+        ]
         return sorted(found, key=lambda f: f.cost)
 
     def _seen_from_start(
@@ -331,10 +359,9 @@ class Search:
         return settle(self.problem, found, self.rows, moves=2)[1]
 
     def _known(self, candidate: Candidate) -> Candidate:
-        names = tuple(sorted(candidate.names))
-        known = self.found.get(names)
+        known = self.found.get(candidate.key)
         if candidate.fit.complete and (known is None or candidate.penalised <= known.penalised):
-            self.found[names] = candidate
+            self.found[candidate.key] = candidate
         return candidate
 
     def thoroughly(self) -> Search:
@@ -443,7 +470,7 @@ class Search:
 
     def refitted(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         """Candidates of another problem, each fitted in this one unless it was already."""
-        todo = [c for c in candidates if self.found.get(tuple(sorted(c.names))) is not c]
+        todo = [c for c in candidates if self.found.get(c.key) is not c]
         done = iter(self.each(Search._refit, [(c, 8) for c in todo], "noise afresh: refit"))
         return [self._known(next(done) if c in todo else c) for c in candidates]
 
@@ -483,20 +510,20 @@ class Search:
             )
         ]
         ended, others = self._refits(chosen, text, worth)
-        ranked = sorted((self._known(c) for c in (*ended, *others)), key=lambda c: c.penalised)
+        fitted = [self._known(c) for c in (*ended, *others)]
+        best = [self.found.get(c.key, c) for c in fitted]
+        # What was known before was polished where that was worth it.
+        done = {c.key for c, known in zip(fitted, best, strict=True) if c is not known}
+        done |= {c.key for c in ended}
+        ranked = sorted(best, key=lambda c: c.penalised)
         # On a slow plant polishing is long, and the best are polished already.
         most = min(worth, HOPELESS * ranked[0].penalised) if self.slow and ranked else worth
-        done = {c.names for c in ended}
-        worthy = [c for c in ranked[:POLISH] if c.penalised < most and c.names not in done]
+        worthy = [c for c in ranked[:POLISH] if c.penalised < most and c.key not in done]
         ranked = self._polished(ranked, worthy, text)
         if not self.slow and ranked and (ranked[0].far_off or ranked[0].penalised >= worth):
-            done |= {c.names for c in worthy}
-            known = {key: base for key, (base, _) in todo.items()}
-            bent = [
-                c
-                for c in ranked[:REFIT]
-                if c.far_off and c.names not in done and self._led_astray(known[tuple(sorted(c.names))])
-            ]
+            done |= {c.key for c in worthy}
+            rest = [c for c in ranked[:REFIT] if c.far_off and c.key not in done]
+            bent = [c for c in rest if self._led_astray(todo[c.key][0])]
             ranked = self._polished(ranked, bent, text)
         return ranked
 
@@ -686,6 +713,11 @@ def _work(
 def _candidate(names: Names, found: Fit) -> Candidate:
     """A fitted set with what its free parameters cost."""
     return Candidate(names, found, found.cost + _penalty(found.coordinates))
+
+
+def _still(coordinates: Sequence[Coordinate], start: Mapping[str, float], place: Fit) -> dict[str, float]:
+    """A start with the nuisance parameters where a place has them."""
+    return {c.name: (place.point if c.prior else start).get(c.name, 0.0) for c in coordinates}
 
 
 def _penalty(coordinates: Sequence[Coordinate]) -> float:

@@ -65,7 +65,7 @@ class AnchoredRig:
         self.trials = exact.trials
         self.floor, self.finest = exact.floor, exact.finest
         self.points, self.pooled = exact.points, exact.pooled
-        self.approximate = True
+        self.approximate, self.foreign = True, exact.foreign
         self.drive_signals, self.without = exact.drive_signals, exact.without
         self.phases, self.figures, self.experiments = exact.phases, exact.figures, exact.experiments
         self.machine = exact.machine

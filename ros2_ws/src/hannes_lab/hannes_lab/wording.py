@@ -9,17 +9,25 @@ import numpy as np
 from .adequacy import shortfall
 from .chance import Chance
 from .choose import Choice, needed_gain
+from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
 from .falls import NO_REPEATS, fall_sentence
-from .fit import Fit
-from .problem import Coordinate, Problem
+from .fit import Fit, fit
+from .problem import Coordinate, Problem, nuisance_coordinate
+from .rig import Nuisance
 from .search import FAR, PENALTY, Candidate, Search
 
 ANY_DIFFERENCE = (
     "a difference of any size counts here that chance does not explain; no simple model of a real machine is that "
     "exact: --greedy adds effects for as long as the error on conditions that were left out of the fit falls"
 )
+
+CLOCK_PART = 0.25
+"""Part of the misfit that another clock of the reference must remove to be worth a note."""
+
+CLOCK_STEPS = 6
+"""Length of the fit that tells it."""
 
 MANY_FAILURES = 0.05
 """Part of the simulations that did not stay finite from which on their parameters are worth a look."""
@@ -32,23 +40,29 @@ def summary(
     tied: Sequence[Sequence[str]],
     falls: Sequence[Fall],
     limits: Chance,
+    choice: Choice,
     best: Candidate,
-    nearest: str,
 ) -> str:
     """The verdict in a sentence or two: what is missing, how the error falls, and what to be careful with."""
     fall = fall_sentence(falls)
     far = _moved_far(best)
     if verdict == "nothing":
-        return (
-            f"Nothing is missing: with its own parameters fitted, the model's misfit {best.fit.cost:.0f} is below what "
-            f"chance reaches ({limits.misfit:.0f}), and no effect of the catalogue gains more than chance would. "
-            + (
-                f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability."
-                if np.isfinite(falls[-1].held_out)
-                else NO_REPEATS
-            )
-            + (far and far + nearest)
+        explained = (
+            f"the model's misfit {best.fit.cost:.0f} is below what chance reaches ({limits.misfit:.0f})"
+            if choice.adequate
+            else f"the model's error on conditions that were left out is {falls[-1].held_out_conditions:.2f} times the "
+            "repeatability"
         )
+        other = choice.idle and f", though {choice.idle}"
+        if not other and choice.adequate:
+            other = ", and no effect of the catalogue gains more than chance would"
+        held = (
+            f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability."
+            if np.isfinite(falls[-1].held_out)
+            else NO_REPEATS
+        )
+        nearest = "" if choice.idle else nearest_sentence(choice)
+        return f"Nothing is missing: with its own parameters fitted, {explained}{other}. {held}{far and far + nearest}"
     names = " and ".join(e.title for e in effects)
     if verdict == "effects":
         tie = ""
@@ -67,11 +81,29 @@ def notes(
     """What else a user must know of an answer, a sentence each."""
     return (
         *_any_difference(search, verdict, greedy),
+        *(clock_note(search.problem, best.fit) if greedy or verdict == "unknown" else ()),
         *_inseparable(search, experiments),
         *_ends(best),
         *_undescribed(best),
         *_identifiability(best),
         *failure_notes(search.problem),
+    )
+
+
+def idle_sentence(whole: Candidate, part: Candidate, with_all: Fall, with_part: Fall) -> str:
+    """Why effects of a set that fits better are not named."""
+    more = [name for name in whole.names if name not in part.names]
+    pairs = (
+        ("closures", with_part.held_out, with_all.held_out),
+        ("conditions", with_part.held_out_conditions, with_all.held_out_conditions),
+    )
+    errors = " and ".join(
+        f"{b:.2f} instead of {a:.2f} on {what}" for what, a, b in pairs if np.isfinite([a, b]).all()
+    )
+    return (
+        f"{' and '.join(more)} would fit better (misfit {whole.fit.cost:.0f} instead of {part.fit.cost:.0f}), but not "
+        f"foretell better what took no part in the fit: an error of {errors} that were left out, in multiples of the "
+        "repeatability"
     )
 
 
@@ -117,6 +149,30 @@ def failure_notes(problem: Problem) -> list[str]:
     return [
         f"{problem.failures} of {problem.simulations} simulations did not stay finite and counted as very bad fits "
         f"({meaning})"
+    ]
+
+
+def clock_note(problem: Problem, found: Fit) -> list[str]:
+    """Whether what is left looks as if the reference had been logged earlier or later, where that is not fitted yet.
+
+    Only on machines of others, see Rig.foreign: a hand's recordings tell their clock, or it is fitted.
+    """
+    rig, fitted = problem.rig, {c.name for c in found.coordinates}
+    if REFERENCE_DELAY in fitted or not rig.foreign or rig.approximate or found.cost <= 0.0:
+        return []
+    tick = min(trial.period for trial in problem.features.trials)
+    clock = Nuisance(
+        REFERENCE_DELAY, 0.0, REFERENCE_DELAY_SD, False, unit="s", step=0.5 * tick / REFERENCE_DELAY_SD
+    )
+    coordinates = (*found.coordinates, nuisance_coordinate(clock))
+    moved = fit(problem, found.model, coordinates, found.point, evaluations=CLOCK_STEPS)
+    part, delay = 1.0 - moved.cost / found.cost, moved.values[REFERENCE_DELAY]
+    if part < CLOCK_PART:
+        return []
+    return [
+        f"what is left looks as if the signals were {'later' if delay > 0.0 else 'earlier'} than the reference's clock "
+        f"says, by {1e3 * abs(delay):.2g} ms: that alone would remove {100.0 * part:.0f} % of the misfit; mend it "
+        f"where the recordings are read, or let it be fitted ({REFERENCE_DELAY} in an adapter's tolerances)"
     ]
 
 

@@ -1,0 +1,97 @@
+"""A fit in closed loop: derivatives are taken seldom, and it ends where one that takes them always would."""
+
+import numpy as np
+import pytest
+from hannes_description.model import Model
+from hannes_lab.fit import Derivatives, fit, prior_weights
+from hannes_lab.hide import make_set
+from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.problem import Coordinate, nuisance_coordinate
+from hannes_lab.trials import make_trial
+from scipy.optimize import least_squares
+
+
+@pytest.fixture(scope="module")
+def prepared() -> Prepared:
+    recordings, _ = make_set(Model.load(), [], seed=43, closures=6, conditions=("fast", "grasp_fast"))
+    return prepare([make_trial(r) for r in recordings], Model.load())
+
+
+def test_a_fit_ends_where_fresh_derivatives_at_every_step_lead(prepared: Prepared) -> None:
+    problem, model = prepared.problem, prepared.model
+    coordinates = [nuisance_coordinate(n) for n in prepared.nuisances]
+    prior = prior_weights(coordinates)
+    low, high = np.array([c.bounds for c in coordinates]).T
+    start = np.full(len(coordinates), 0.5)
+
+    def residual(z: np.ndarray) -> np.ndarray:
+        values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
+        return np.concatenate([problem.residual(model, values), prior * z])
+
+    def all_afresh(z: np.ndarray) -> np.ndarray:
+        at = residual(z)
+        steps = [c.inside_step(float(v)) for c, v in zip(coordinates, z, strict=True)]
+        moved = [residual(z + step * row) for step, row in zip(steps, np.eye(z.size), strict=True)]
+        return np.column_stack([(r - at) / step for r, step in zip(moved, steps, strict=True)])
+
+    problem.counts.simulations = 0
+    wanted = least_squares(residual, start, jac=all_afresh, bounds=(low, high), ftol=1e-5, xtol=1e-5)
+    of_all, problem.counts.simulations = problem.simulations, 0
+    found = fit(problem, model, coordinates, start, evaluations=25)
+    assert found.complete
+    assert found.cost == pytest.approx(2.0 * wanted.cost, rel=0.01)
+    assert problem.simulations < 0.9 * of_all
+
+
+class Curved:
+    """A problem of two coordinates, r = A z + 0.1 z^2, that counts its simulations."""
+
+    failures = 0
+    size = 2
+
+    def __init__(self) -> None:
+        self.simulations = 0
+        self.features = self
+
+    def residual(self, model: object, values: dict[str, float]) -> np.ndarray:
+        self.simulations += 1
+        return self.at(np.array([values["a"], values["b"]]))
+
+    @staticmethod
+    def at(z: np.ndarray) -> np.ndarray:
+        return np.array([[300.0, 20.0], [50.0, 400.0]]) @ z + 10.0 * z**2 + 5.0
+
+
+A, B = (Coordinate(name, 0.0, 1.0, False, -10.0, 10.0, True, 1e-4) for name in "ab")
+BEGIN = np.array([1.0, 1.0])
+
+
+def derivatives(problem: Curved, known: dict[str, np.ndarray], most: int = 10) -> Derivatives:
+    def cost(r: np.ndarray, z: np.ndarray) -> float:
+        return float(r @ r)
+
+    found = Derivatives(problem, Model.load(), (A, B), known, {}, cost, most)  # type: ignore[arg-type]
+    found.at(BEGIN, problem.at(BEGIN))
+    return found
+
+
+def test_a_step_teaches_the_derivatives_what_they_missed() -> None:
+    problem = Curved()
+    taught = derivatives(problem, {})
+    assert taught.fresh and problem.simulations == 2
+    z = np.array([0.8, 0.85])
+    after = taught.at(z, problem.at(z))
+    assert problem.simulations == 2 and not taught.fresh
+    np.testing.assert_allclose(after @ (z - BEGIN), problem.at(z) - problem.at(BEGIN))
+    taught.forget()
+    taught.at(z, problem.at(z))
+    assert problem.simulations == 4 and taught.fresh
+
+
+def test_derivatives_that_promised_too_much_are_taken_anew_unless_they_are_known_or_enough_were() -> None:
+    worse = np.array([1.5, 1.5])
+    wrong = {"a": np.array([-300.0, 0.0]), "b": np.array([0.0, -400.0])}
+    for known, most, taken in (({}, 10, 4), ({}, 3, 2), (wrong, 10, 0), ({"a": wrong["a"]}, 10, 2)):
+        problem = Curved()
+        derivatives(problem, known, most).at(worse, problem.at(worse))
+        assert problem.simulations == taken

@@ -1,0 +1,51 @@
+"""Of closures that repeat each other only as many are simulated as do not yet end as the one before."""
+
+import numpy as np
+import pytest
+from hannes_description.model import Model
+from hannes_lab.features import build_features, compact_end
+from hannes_lab.hand import HandRig
+from hannes_lab.hide import make_set
+from hannes_lab.repeats import FEW, end_of
+from hannes_lab.trials import Trial, make_trial
+from hannes_sim.effect import load_effect
+
+
+@pytest.fixture(scope="module")
+def trial() -> Trial:
+    recordings, _ = make_set(Model.load(), [], seed=41, closures=10, conditions=("fast",))
+    return make_trial(recordings[0])
+
+
+def simulated(trial: Trial, **hysteresis: float) -> tuple[list[int], float, float]:
+    """Ticks of each rollout, and how far closures are from those of the whole trial: as predicted, and if the second
+    one stood for all that follow."""
+    model = Model.load().with_effect(load_effect("glove_hysteresis").entry(hysteresis))
+    ticks: list[int] = []
+
+    class Counted(HandRig):
+        def run(self, model, values, trial, reference):  # type: ignore[no-untyped-def]
+            ticks.append(reference.size)
+            return super().run(model, values, trial, reference)
+
+    rig, features = Counted([trial]), build_features([trial], ("motor_current",))
+    (block,) = features.blocks
+    whole = rig.simulate(model, {}, trial, trial.reference)["motor_current"]
+    ticks.clear()
+    exact, (found,) = block.predicted(whole, False), features.closures(rig, model, {})
+    span = float(np.ptp(exact))
+    copied = block.predicted(whole[: compact_end(trial)], True)
+    return ticks, float(np.abs(found - exact).max()) / span, float(np.abs(copied - exact).max()) / span
+
+
+def test_a_glove_that_creeps_back_within_a_few_closures(trial: Trial) -> None:
+    ticks, worst, of_two = simulated(trial, stiffness=0.004, relaxation=0.3)
+    assert ticks == [compact_end(trial), end_of(trial, FEW)]
+    assert ticks[1] < 0.6 * trial.reference.size
+    assert worst < 0.05 * of_two and of_two > 1e-3
+
+
+def test_a_glove_that_creeps_for_longer_than_that(trial: Trial) -> None:
+    ticks, worst, _ = simulated(trial, stiffness=0.004, relaxation=2.0)
+    assert ticks == [compact_end(trial), end_of(trial, FEW), trial.reference.size]
+    assert worst == 0.0
