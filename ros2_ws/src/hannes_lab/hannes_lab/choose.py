@@ -12,7 +12,7 @@ from .adequacy import is_adequate, shortfall
 from .chance import Chance, chance
 from .diagnosis import Rank
 from .greedy import grow
-from .search import HOPELESS, PENALTY, Candidate, Search
+from .search import HOPELESS, PENALTY, Candidate, Search, key_of
 
 WORTHWHILE = 0.05
 """A further effect must remove at least this part of the cost, or of the mean square error on held-out conditions."""
@@ -245,7 +245,7 @@ def _extended(
         left = [p for p in parts if p not in extended]
         if not left:
             break
-        bases = [search.fitted(tuple(sorted(p))) for p in left]
+        bases = [search.fitted(key_of(p)) for p in left]
         extended |= set(left)
         better = search.extend(bases, names, f"{text}, exchanged", round_[0].penalised)
         round_ = _best_of(round_, better)

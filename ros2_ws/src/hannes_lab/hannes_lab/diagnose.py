@@ -26,7 +26,7 @@ from .features import data_used
 from .fit import Fit
 from .prepare import Prepared
 from .screen import usable_effects
-from .search import Candidate, Progress, Search, silent
+from .search import Candidate, Progress, Search, key_of, silent
 from .wording import at_end_of_range, idle_sentence, notes, summary
 
 Array = NDArray[np.float64]
@@ -109,7 +109,7 @@ def diagnose(
     best = search.with_spread(best)
     effects = found_effects(search, best, limits, falls)
     experiments = (
-        separating_experiments(prepared, search, [search.found[tuple(sorted(n))] for n in tied])
+        separating_experiments(prepared, search, [search.found[key_of(n)] for n in tied])
         if len(tied) > 1
         else ()
     )
@@ -151,7 +151,7 @@ def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple
         keep -= 1
     if keep == len(choice.best.names) or not (rig.foreign or choice.search.problem.discrepancy):
         return choice, falls
-    part = choice.search.found[tuple(sorted(fall.added for fall in falls[2 : keep + 2]))]
+    part = choice.search.found[key_of(fall.added for fall in falls[2 : keep + 2])]
     if not is_adequate(choice.search, part, choice.limits):
         return choice, falls
     fewer = falls[: keep + 2]

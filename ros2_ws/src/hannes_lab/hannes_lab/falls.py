@@ -20,7 +20,7 @@ from .features import Features
 from .prepare import Prepared
 from .problem import Problem, build_problem
 from .rig import Rig
-from .search import Candidate, Search
+from .search import Candidate, Search, key_of
 from .settle import slopes_at
 from .surrogate import exact_rig
 
@@ -52,8 +52,7 @@ def error_falls(
     left = list(best.names)
     while left:
         options = [
-            search.found.get(tuple(sorted((*chain, name))))
-            or search.add(search.found[tuple(sorted(chain))], name)
+            search.found.get(key_of((*chain, name))) or search.add(search.found[key_of(chain)], name)
             for name in (left[:1] if in_order else left)
         ]
         pick = min(range(len(options)), key=lambda k: options[k].penalised)
@@ -101,7 +100,7 @@ def worth_showing(
     names = tuple(fall.added for fall in falls[2 : keep + 1])
     if len(names) == len(best.names):
         return best, falls
-    return search.found[tuple(sorted(names))], falls[: keep + 1]
+    return search.found[key_of(names)], falls[: keep + 1]
 
 
 def fall_sentence(falls: Sequence[Fall]) -> str:

@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 FEW = 4
 """Closures that are simulated where the second does not end as the first did; all, if the last two of these do not."""
 
+WORTH = 0.7
+"""Part of a recording below which its first FEW closures are worth being simulated alone."""
+
 MARGIN = 60
 """Ticks beyond the end of a closure: a logger shows its last ones later."""
 
@@ -43,7 +46,9 @@ def came_back(run: Rollout, trial: Trial, most: float) -> bool:
 def few_will_do(trial: Trial) -> bool:
     """Whether FEW closures are many fewer than there are, and the others have the same reference."""
     return (
-        len(trial.closures) > FEW and end_of(trial, FEW) < 0.7 * trial.reference.size and trial.apart <= SAME
+        len(trial.closures) > FEW
+        and end_of(trial, FEW) < WORTH * trial.reference.size
+        and trial.apart <= SAME
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -39,6 +39,11 @@ Names = tuple[str, ...]
 _Approached = tuple[Any, str, list[Any], list[Fit]]
 
 
+def key_of(names: Iterable[str]) -> Names:
+    """Names of effects as the key of their set, whatever the order in which they were found."""
+    return tuple(sorted(names))
+
+
 @dataclass(frozen=True)
 class Candidate:
     """A set of effects with its fit; penalised = cost + PENALTY per effect parameter."""
@@ -49,8 +54,8 @@ class Candidate:
 
     @property
     def key(self) -> Names:
-        """Its names, whatever the order in which they were found: as sets of effects are kept."""
-        return tuple(sorted(self.names))
+        """The key of its set of effects."""
+        return key_of(self.names)
 
     @property
     def pulled(self) -> bool:
@@ -457,14 +462,14 @@ class Search:
         z, jacobian = larger.fit.z[index], larger.fit.jacobian[:, index]
         there = replace(larger.fit, model=model, coordinates=coordinates, z=z, jacobian=jacobian)
         again: Candidate = self.once(Search._refit, Candidate(names, there, np.inf), 15, text="without it")
-        known = self.found.get(tuple(sorted(names)))
+        known = self.found.get(key_of(names))
         return known if known is not None and known.fit.cost <= again.fit.cost else self._known(again)
 
     def fitted(self, names: Names) -> Candidate:
         """The fit of a set: the known one, or one effect after the other."""
         found = self.null()
         for k, name in enumerate(names):
-            known = self.found.get(tuple(sorted(names[: k + 1])))
+            known = self.found.get(key_of(names[: k + 1]))
             found = known or self.polish(self.add(found, name))
         return found
 
@@ -488,7 +493,7 @@ class Search:
         for base in bases:
             for name in names:
                 if name not in base.names:
-                    todo.setdefault(tuple(sorted((*base.names, name))), (base, name))
+                    todo.setdefault(key_of((*base.names, name)), (base, name))
         points = self.each(Search._at_nominal, [(base,) for base in bases], f"{text}: nominal values")
         self._nominal.clear()
         self._nominal.update((point_key(base.fit), point) for base, point in zip(bases, points, strict=True))
