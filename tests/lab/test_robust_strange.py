@@ -181,13 +181,18 @@ def test_a_free_hand_takes_about_what_the_nominal_one_does() -> None:
 
 
 def closing(name: str, position: list[tuple[float, float]], current: list[tuple[float, float]]) -> Trial:
-    """A recording of one closure: position by time, current by time."""
-    time = np.arange(0.0, 4.0, 0.01)
-    signals = {
-        signal: (time, np.interp(time, *np.transpose(points)))
-        for signal, points in (("encoder_position", position), ("motor_current", current))
-    }
-    reference = np.interp(np.arange(0.0, 4.0, 0.001), *np.transpose(position))
+    """A recording of one closure: position by time, rounded over 0.2 s, and current by time without what inertia takes."""
+    value = Model.load().parameters.value
+    time = np.arange(0.0, 4.0, 0.005)
+    moved, still = (np.interp(time, *np.transpose(points)) for points in (position, current))
+    window = np.hanning(41)
+    moved = np.convolve(np.pad(moved, 20, mode="edge"), window / window.sum(), "valid")
+    velocity = np.gradient(moved, time)
+    inertia = value("motor.armature") * value("gear.ratio") ** 2 + value("hand.inertia")
+    torque = inertia * np.gradient(velocity, time) + value("friction.viscous") * velocity
+    per_ampere = value("motor.kt") * value("gear.ratio") * value("gear.efficiency")
+    signals = {"encoder_position": (time, moved), "motor_current": (time, still + torque / per_ampere)}
+    reference = np.interp(np.arange(0.0, 4.0, 0.001), time, moved)
     return Trial(name, 0.001, reference, signals, (Closure(0.0, 4.0, name),))
 
 

@@ -1,8 +1,8 @@
 """Was something grasped, and about how stiff and where?  Read from the closures where nobody said so.
 
 While closing, an object adds a force that grows from one position on; no closure on nothing shows it there.  So the
-drive current against position is compared with that of the other recordings of the set, or, where none of them comes
-so far, with the nominal hand's.  A glove or a tight spring is there in all recordings, and is no object.
+drive current against position, without that part of it which accelerates the nominal hand, is compared with that of the
+other recordings of the set, or, where none of them comes so far, with the nominal hand's.  A glove or a tight spring is there in all recordings, and is no object.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from hannes_description.model import Model
 from hannes_sim.objects import GraspObject
 from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
+from scipy.signal import savgol_filter
 
 from .hand import HandRig
 from .surrogate import FAST_PLANT
@@ -36,6 +37,12 @@ LEAST_FREE = 0.8
 
 RIPPLE_OVER = 0.1
 """Part of the way over which the current's own trend is taken: what comes and goes within it is a ripple, no object."""
+
+STEP = 2.5e-3
+"""s between the points of the mean closing."""
+
+SMOOTH, SAMPLES = 0.05, 8
+"""s, and samples at least, over which its current and its acceleration are taken."""
 
 STANDS = 1e-3
 """Part of the way that counts as one place."""
@@ -112,16 +119,18 @@ def _error(trial: Trial, model: Model) -> float:
 def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:
     """Encoder position (p,) rad, increasing, and current (p,) A of the mean closing; None without an encoder.
 
-    Without a current, that which the nominal controller would ask for if the hand stood still.
+    The current is that which a hand without inertia and viscous friction would have taken.  Without a current, that which the nominal controller would ask for if the hand stood still.
     """
     if "encoder_position" not in trial.signals:
         return None
     closures = trial.of(trial.conditions[0])
     length = min(c.stop - c.start for c in closures)
-    phase = np.linspace(0.0, length, 400)
+    phase = np.linspace(0.0, length, max(round(length / STEP), 400))
     position = trial.mean_closure("encoder_position", phase)
     if "motor_current" in trial.signals:
-        current = trial.mean_closure("motor_current", phase)
+        sampled = float(np.median(np.diff(trial.signals["encoder_position"][0])))
+        span = max(SMOOTH, SAMPLES * sampled)
+        current = _still(phase, position, trial.mean_closure("motor_current", phase), span, model)
     else:
         kp, kd = (model.parameters.value(f"control.{n}") for n in ("kp", "damping"))
         ticks = np.arange(trial.reference.size) * trial.period
@@ -135,6 +144,26 @@ def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:
         return None
     q = np.maximum.accumulate(position[rising[0] : top + 1])
     return _advancing(q, current[rising[0] : top + 1])
+
+
+def _still(time: Array, position: Array, current: Array, span: float, model: Model) -> Array:
+    """The current (p,) A without what accelerates the nominal hand and what its viscous friction takes.
+
+    span  s over which the motion is smoothed (Savitzky-Golay filter of the third order)
+    """
+    value = model.parameters.value
+    step = float(time[1] - time[0])
+    window = 2 * max(round(0.5 * span / step), 2) + 1
+    velocity, acceleration = (savgol_filter(position, window, 3, deriv=k, delta=step) for k in (1, 2))
+    inertia = value("motor.armature") * value("gear.ratio") ** 2 + value("hand.inertia")
+    torque = inertia * acceleration + value("friction.viscous") * velocity
+    return np.asarray(savgol_filter(current, window, 3) - torque / _per_ampere(model))
+
+
+def _per_ampere(model: Model) -> float:
+    """Torque per ampere at the pulley, N.m/A."""
+    value = model.parameters.value
+    return value("motor.kt") * value("gear.ratio") * value("gear.efficiency")
 
 
 def _advancing(position: Array, current: Array) -> tuple[Array, Array]:
@@ -151,7 +180,7 @@ def _nominal(model: Model) -> tuple[float, float, float]:
     """Torque of the free hand when closing slowly: at rest (N.m), per rad; and torque per ampere, at the pulley."""
     value = model.parameters.value
     still = value("friction.coulomb") + value("hand.coulomb") + value("hand.preload")
-    return still, value("hand.stiffness"), value("motor.kt") * value("gear.ratio") * value("gear.efficiency")
+    return still, value("hand.stiffness"), _per_ampere(model)
 
 
 def _seen(
