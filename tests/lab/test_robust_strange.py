@@ -181,7 +181,7 @@ def test_a_free_hand_takes_about_what_the_nominal_one_does() -> None:
 
 
 def closing(name: str, position: list[tuple[float, float]], current: list[tuple[float, float]]) -> Trial:
-    """A recording of one closure: position by time, rounded over 0.2 s, and current by time without what inertia takes."""
+    """A recording of one closure: position by time, rounded over 0.2 s; current by time, without what inertia takes."""
     value = Model.load().parameters.value
     time = np.arange(0.0, 4.0, 0.005)
     moved, still = (np.interp(time, *np.transpose(points)) for points in (position, current))

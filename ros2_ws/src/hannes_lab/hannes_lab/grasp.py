@@ -2,7 +2,8 @@
 
 While closing, an object adds a force that grows from one position on; no closure on nothing shows it there.  So the
 drive current against position, without that part of it which accelerates the nominal hand, is compared with that of the
-other recordings of the set, or, where none of them comes so far, with the nominal hand's.  A glove or a tight spring is there in all recordings, and is no object.
+other recordings of the set, or, where none of them comes so far, with the nominal hand's.  A glove or a tight spring is
+there in all recordings, and is no object.
 """
 
 from __future__ import annotations
@@ -119,7 +120,8 @@ def _error(trial: Trial, model: Model) -> float:
 def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:
     """Encoder position (p,) rad, increasing, and current (p,) A of the mean closing; None without an encoder.
 
-    The current is that which a hand without inertia and viscous friction would have taken.  Without a current, that which the nominal controller would ask for if the hand stood still.
+    The current is that which a hand without inertia and viscous friction would have taken.  Where none is recorded,
+    that which the nominal controller would ask for if the hand stood still.
     """
     if "encoder_position" not in trial.signals:
         return None
