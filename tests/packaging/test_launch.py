@@ -175,7 +175,8 @@ GOOD = """
 import os, signal, sys, time
 signal.signal(signal.SIGINT, lambda *_: sys.exit(0))
 os.write(1, b"up\\n")
-time.sleep(60)
+for _ in range(600):  # a signal just before a sleep is seen after it
+    time.sleep(0.1)
 """
 STUBBORN = """
 import os, signal, time
