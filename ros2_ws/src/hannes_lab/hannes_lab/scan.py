@@ -256,7 +256,10 @@ class _Place:
 
 def _distinct(scored: Sequence[Scored], shape: str) -> list[Scored]:
     """Of the points with the same value of a shape only the first one."""
-    return list({point[shape]: (cost, point) for cost, point in reversed(scored)}.values())[::-1]
+    firsts: dict[float, Scored] = {}
+    for cost, point in scored:
+        firsts.setdefault(point[shape], (cost, point))
+    return list(firsts.values())
 
 
 def period_of(kind: EffectType) -> EffectParameter | None:
