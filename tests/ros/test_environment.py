@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from graph import NodeProcess, processes
@@ -46,6 +47,19 @@ def test_nodes_stay_on_this_machine_unless_the_user_says_otherwise(
     assert (environment[RANGE], Path(environment[PROFILES]).name) == expected
     assert given.items() <= environment.items()
     assert ros_environment(environment) == environment
+
+
+def test_both_profiles_find_and_forget_nodes_alike() -> None:
+    local = Path(ros_environment({})[PROFILES])
+    found = [
+        [
+            "".join(ElementTree.tostring(part, encoding="unicode").split())
+            for name in ("leaseDuration", "leaseAnnouncement", "initialAnnouncements")
+            for part in ElementTree.parse(profile).getroot().iterfind(f".//{{*}}{name}")
+        ]
+        for profile in (local, local.with_name("fastdds.xml"))
+    ]
+    assert len(found[0]) == 3 and found[0] == found[1]
 
 
 @pytest.mark.parametrize("range_", ["SUBNET", "LOCALHOST"])
