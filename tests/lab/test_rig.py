@@ -13,8 +13,10 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.compare import Comparison, compare
 from hannes_lab.diagnose import diagnose, effect_sources
-from hannes_lab.fit import fit
+from hannes_lab.fit import Fit, fit
+from hannes_lab.greedy import _open_ended
 from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.problem import effect_coordinates
 from hannes_lab.rig import Nuisance, linear_unit, load_rig, scaled_effect, unit_factor
 from hannes_lab.screen import usable_effects
 from hannes_lab.search import Candidate, Search
@@ -210,9 +212,9 @@ def test_little_explained_is_unknown(prepared: Prepared) -> None:
 
 def test_unknown_without_greedy_says_what_else_can_be_done(prepared: Prepared) -> None:
     sources = effect_sources(only=["command_delay"])
-    found = diagnose(prepared, sources)
+    found = diagnose(prepared, sources, greedy=False)
     assert found.verdict == "unknown" and any("--greedy adds effects" in note for note in found.notes)
-    assert not any("--greedy adds" in note for note in diagnose(prepared, sources, greedy=True).notes)
+    assert not any("--greedy adds" in note for note in diagnose(prepared, sources).notes)
 
 
 def test_the_model_file_says_what_is_printed(prepared: Prepared, tmp_path: Path) -> None:
@@ -286,8 +288,44 @@ def test_an_error_as_small_as_the_machine_repeats_leaves_nothing_to_look_for(
     prepared: Prepared, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a real machine chance never explains the rest; on --greedy the error on other conditions decides."""
-    sources = effect_sources(only=["gear_backlash"])
-    monkeypatch.setattr("hannes_lab.choose.AS_IT_REPEATS", 1e6)
-    found = diagnose(prepared, sources, greedy=True)
-    assert found.verdict == "nothing" and not found.effects
+    sources = effect_sources(only=["coulomb_friction"])
+    for module in ("choose", "greedy"):
+        monkeypatch.setattr(f"hannes_lab.{module}.AS_IT_REPEATS", 1e6)
+    found = diagnose(prepared, sources)
+    assert found.verdict == "nothing" and not found.effects, "though the effect would lower it"
     assert "error on conditions that were left out is" in found.summary and "chance" not in found.summary
+    assert any("leaves nothing to look for" in note for note in found.notes)
+
+
+def test_an_effect_at_the_end_of_its_range_must_take_half_of_the_error(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only = effect_sources(only=["coulomb_friction", "cogging"])
+    both = diagnose(prepared, only)
+    assert [effect.name for effect in both.effects] == ["coulomb_friction", "cogging"]
+    before, after = (fall.held_out_conditions for fall in both.falls[-2:])
+    monkeypatch.setattr("hannes_lab.greedy._open_ended", lambda candidate, base: "cogging.period")
+    monkeypatch.setattr("hannes_lab.greedy.HALF", 0.9 * (after / before) ** 2)
+    cut = diagnose(prepared, only)
+    assert [effect.name for effect in cut.effects] == ["coulomb_friction"]
+    assert any(
+        "for the interval of cogging.period reaches the end of its range" in note for note in cut.notes
+    )
+
+
+def test_a_parameter_of_which_the_range_gives_one_end_is_open_ended() -> None:
+    """Not the strength that an effect has at least, and not a parameter that the data hold."""
+    coordinates = tuple(effect_coordinates(load_effect("presliding_friction")))
+    level, length = (c.name for c in coordinates)
+    least = coordinates[1].bounds[0]
+
+    def named(off: float, precision: float, base: tuple[str, ...] = ()) -> str:
+        z = np.array([0.5, least + off])
+        found = Fit(Model.load(), coordinates, z, 1.0, np.ones(2), precision * np.eye(2))
+        alone = Candidate(base, found, 1.0)
+        return _open_ended(Candidate((*base, "presliding_friction"), found, 1.0), alone)
+
+    assert (level, length) == ("presliding_friction.level", "presliding_friction.length")
+    assert named(0.5, 10.0) == "" and named(0.5, 3.0) == length and named(0.0, 100.0) == length
+    assert named(2.5, 1.0) == "", "a strength may be nought"
+    assert named(0.0, 100.0, ("presliding_friction",)) == "", "it was there before"

@@ -141,6 +141,7 @@ def test_what_read_returns_must_be_trials(lab: Lab, read: str, said: str) -> Non
         ("closures(t, lambda c: (c.start, c.stop))", "closure 1 is a tuple"),
         ("replace(t, reference=t.reference[:5000])", "but the reference from 0 to 4.999 s"),
         ("position(t, lambda x, y: (x[::800], y[::800]))", "has a sample every 0.8 s, but a closure lasts"),
+        ("closures(t, lambda c: replace(c, condition='lap'))", "both 'lap', but their references are 0.0289 m apart"),
     ],
 )  # fmt: skip
 def test_a_recording_that_cannot_be_replayed_is_refused(lab: Lab, change: str, said: str) -> None:
@@ -151,6 +152,33 @@ def test_a_recording_that_cannot_be_replayed_is_refused(lab: Lab, change: str, s
 def test_numbers_may_come_as_lists(lab: Lab) -> None:
     code, out, _ = lab("position(t, lambda x, y: (list(x), list(y)))")
     assert code == 0 and out == lab()[1]
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ("sizes = {'Nm': 3.0}", "Mine.sizes: 'Nm': 3.0; it takes positive numbers for N.m, rad, V, A, s"),
+        ("sizes = {'N.m': -3.0}", "Mine.sizes: 'N.m': -3.0"),
+        ("without = {'gravitation': 'level'}", "no effect of the catalogue; is 'gravity' meant?"),
+    ],
+)
+def test_what_the_class_says_wrongly_is_refused(lab: Lab, more: str, said: str) -> None:
+    assert said in lab.refused(more=more)
+
+
+def test_what_the_class_leaves_out_is_said(lab: Lab) -> None:
+    code, out, _ = lab(more="sizes = {}")
+    assert code == 0 and "Mine gives no `sizes`" in out and "0.05 N.m, 14.57 rad" in out
+    with_model(
+        lab, armature="  armature: {value: 2, unit: g, lower: 1, upper: 9, status: assumed, source: x}"
+    )
+    assert "armature" not in lab()[1], "of a linear machine a mass may come in other units"
+    assert "motor.armature is given in 'g' and taken as kg.m2" in lab(more="linear = False")[1]
+
+
+def test_a_recording_that_is_not_there_is_refused(lab: Lab) -> None:
+    code, _, err = lab("t", str(lab.here / "none.npz"))
+    assert code == 2 and "No recording" in err and "none.npz': the path does not exist" in err
 
 
 @pytest.mark.parametrize(
@@ -308,6 +336,10 @@ def test_any_control_period_is_simulated(lab: Lab) -> None:
         ),
         ("position(t, lambda x, y: (x, -y))", "encoder_position moves against its reference"),
         ("signal(t, 'drive_force', lambda x, y: (x, 1e3 * y))", "is it recorded in another unit?"),
+        (
+            "signal(t, 'drive_force', lambda x, y: (x, -y))",
+            "drive_force goes against its simulation (correlation -1.00)",
+        ),
         ("replace(t, reference=np.append(t.reference, np.zeros(2000)))", "is its period of 0.001 s right?"),
     ],
 )

@@ -133,3 +133,20 @@ def test_grouping_ignores_small_differences_only() -> None:
     spans = find_closures(reference, 1e-3)
     kinds = {c.condition for c in group_closures(reference, 1e-3, spans, "c")}
     assert len(spans) == 4 and len(kinds) == 2
+
+
+def test_a_closure_ends_before_the_next_one_leaves_its_rest() -> None:
+    """A soft start is seen late: in all closures but the last the next one's would be the end of it."""
+    u = np.linspace(0.0, 1.0, 1000)
+    rise = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
+    closure = np.concatenate([np.zeros(500), rise, np.ones(300), 1.0 - rise, np.zeros(200)])
+    for rest in (0.0, 0.4):
+        reference = rest + 5.0 * np.tile(closure, 4)
+        spans = find_closures(reference, 1e-3)
+        assert len(spans) == 4
+        for start, stop in spans:
+            ends = reference[[round(1e3 * start), min(round(1e3 * stop), reference.size - 1)]]
+            assert ends == pytest.approx(rest, abs=5e-3)
+        assert [start for start, _ in spans] == pytest.approx([0.5 + 3.0 * k for k in range(4)], abs=0.05)
+    never_still = reference + 0.01 * np.sin(np.arange(reference.size))
+    assert len(find_closures(never_still, 1e-3)) == 4

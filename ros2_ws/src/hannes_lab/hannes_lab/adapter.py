@@ -10,15 +10,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 
 import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_sim.effect import catalogue
 from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
 from .features import Features, kind_of, stands_for_all
-from .rig import Rig
+from .rig import REFERENCE_SIZES, PlantRig, Rig
 from .trials import EARLY, Closure, NoClosure, Part, Trial, has_gap, left_out, unique_names
 from .units import AGAINST, ENCODER, FOLLOWS, follows
 
@@ -35,6 +37,42 @@ FAR_OFF = 100.0
 
 SHORTEST = 3.0
 """Control periods that a closure lasts at least."""
+
+OTHER_MOVE = 0.3
+"""Mean difference of the references of two closures, in what they go over, from which one does not repeat the other."""
+
+TYPED = ("motor.armature", "motor.resistance", "motor.inductance", "friction.coulomb", "friction.viscous")
+"""Parameters whose unit on a turning machine can only be one."""
+
+
+def check_rig(rig: Rig, model: Model) -> list[str]:
+    """Refuse what an adapter's class says wrongly, and give what it leaves out, in sentences."""
+    if not isinstance(rig, PlantRig):
+        return []
+    who, sizes = type(rig).__name__, dict(rig.sizes)
+    for token, size in sizes.items():
+        if token not in REFERENCE_SIZES or not (isinstance(size, int | float) and 0.0 < size < math.inf):
+            raise HannesError(
+                f"{who}.sizes: '{token}': {size!r}; it takes positive numbers for {', '.join(REFERENCE_SIZES)} (on a "
+                "linear machine too, where they count as N and m)."
+            )
+    unknown = next((name for name in rig.without if name not in catalogue()), None)
+    if unknown is not None:
+        near = get_close_matches(unknown, catalogue(), 1)
+        meant = f"; is '{near[0]}' meant?" if near else f": {', '.join(catalogue())}."
+        raise HannesError(f"{who}.without names '{unknown}', which is no effect of the catalogue{meant}")
+    notes = []
+    if not sizes:
+        usual = ", ".join(f"{size:g} {token}" for token, size in REFERENCE_SIZES.items() if token != "s")
+        notes.append(
+            f"{who} gives no `sizes`: the effects of the catalogue have bounds and typical values of a drive of {usual}"
+        )
+    hand = Model.load().parameters
+    for name in TYPED if not rig.linear else ():
+        if name in model.parameters and model.parameters[name].unit != hand[name].unit:
+            given = model.parameters[name].unit
+            notes.append(f"{name} is given in '{given}' and taken as {hand[name].unit}: is that what it is?")
+    return notes
 
 
 def check_trials(found: object, rig: str) -> list[Trial]:
@@ -79,6 +117,7 @@ def _checked(trial: Trial, where: str) -> Trial:
     )
     _check_times(trial, where)
     trial = _noticed(trial, where)
+    _check_repeats(trial, where)
     _check_parts(trial, where)
     return trial
 
@@ -198,6 +237,24 @@ def _check_times(trial: Trial, where: str) -> None:
             )
 
 
+def _check_repeats(trial: Trial, where: str) -> None:
+    """Closures of one condition repeat each other: moves there and back, under one name, would scatter by their way."""
+    ticks = np.arange(trial.reference.size) * trial.period
+    for condition in trial.conditions:
+        first, *others = trial.of(condition)
+        for other in others:
+            phase = np.arange(0.0, min(c.stop - c.start for c in (first, other)), trial.period)
+            one, two = (np.interp(c.start + phase, ticks, trial.reference) for c in (first, other))
+            span = max(float(np.ptp(one)), float(np.ptp(two)))
+            apart = float(np.abs(one - two).mean())
+            if apart > OTHER_MOVE * span:
+                raise HannesError(
+                    f"{where}: the closures at {first.start:.6g} and {other.start:.6g} s are both '{condition}', but "
+                    f"their references are {apart:.3g} {trial.unit(ENCODER)} apart in the mean and go over {span:.3g}: "
+                    "they do not repeat one another. Give each move, and each direction, a condition of its own."
+                )
+
+
 def _covers(time: Array, closure: Closure) -> bool:
     step = float(np.median(np.diff(time)))
     return bool(time[0] - step <= closure.start + step and closure.stop - step <= time[-1] + step)
@@ -270,6 +327,9 @@ def _unlike(name: str, unit: str, reference: Samples, simulated: Samples, measur
     if name != ENCODER:
         if here > 0.0 and there > 0.0 and not 1.0 / FAR_OFF < there / here < FAR_OFF:
             return f"{name} goes over {there:.3g} {unit}, simulated over {here:.3g}: is it recorded in another unit?"
+        alike = follows(simulated, measured)
+        if alike is not None and alike[1] < AGAINST:
+            return f"{name} goes against its simulation (correlation {alike[1]:.2f}): has it the other sign?"
         return None
     ours, theirs = follows(reference, simulated), follows(reference, measured)
     # In closed loop the simulated position follows whatever the parameters are; open loop has another reference.

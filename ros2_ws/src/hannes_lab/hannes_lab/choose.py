@@ -11,7 +11,7 @@ from hannes_description.errors import HannesError
 from .adequacy import is_adequate, shortfall
 from .chance import Chance, chance
 from .diagnosis import Rank
-from .greedy import grow
+from .greedy import AS_IT_REPEATS, grow
 from .search import HOPELESS, PENALTY, Candidate, Search, key_of
 
 WORTHWHILE = 0.05
@@ -39,11 +39,9 @@ HALF = 0.5
 """Effects that were added one after another are the answer where the error on held-out conditions, above the
 repeatability, falls to this part; where more is left, what is missing is something else."""
 
-AS_IT_REPEATS = 1.15
-"""An error on held-out conditions, in multiples of the repeatability, that leaves nothing to look for on a real
-machine: chance alone makes it 1."""
-
 MAX_EFFECTS = 3
+MAX_GREEDY = 7
+"""Most effects that are named, by the smallest set that explains all and one after another."""
 
 WIDE = (4, 3)
 """How many of the best singles and pairs are extended by every further effect."""

@@ -25,7 +25,7 @@ from rich.table import Table
 
 from .add import Addition, add_effects, with_provenance
 from .cache import Store
-from .choose import MAX_EFFECTS
+from .choose import MAX_EFFECTS, MAX_GREEDY
 from .compare import Comparison, MetricRow
 from .compare import compare as compare_model
 from .diagnose import diagnose as diagnose_model
@@ -71,14 +71,20 @@ RigFile = Annotated[
     ),
 ]
 MaxEffects = Annotated[
-    int, typer.Option("--max-effects", min=1, help="Most effects that a diagnosis may name.")
+    int | None,
+    typer.Option(
+        "--max-effects",
+        min=1,
+        help=f"Most effects that a diagnosis may name (default: {MAX_EFFECTS}; with --greedy {MAX_GREEDY}).",
+    ),
 ]
 Greedy = Annotated[
-    bool,
+    bool | None,
     typer.Option(
-        "--greedy",
-        help="Add effects one after another while the error on held-out conditions falls by 5 %: many small effects "
-        "of a real machine.",
+        "--greedy/--no-greedy",
+        help="Add effects one after another while the error on held-out conditions falls by 5 %, many small effects "
+        "of a real machine, or look for the smallest set that explains all. Default: --greedy for recordings of a "
+        "machine that no model has the form of (a --rig) under two conditions or more.",
     ),
 ]
 Signals = Annotated[list[str] | None, typer.Option("--signal", help="Compare only these signals.")]
@@ -355,8 +361,8 @@ def diagnose(
     topics: Topics = None,
     signals: Signals = None,
     rig: RigFile = None,
-    max_effects: MaxEffects = MAX_EFFECTS,
-    greedy: Greedy = False,
+    max_effects: MaxEffects = None,
+    greedy: Greedy = None,
     jobs: Jobs = _JOBS,
     dask: Dask = None,
     no_cache: NoCache = False,
@@ -593,8 +599,8 @@ def report(
     topics: Topics = None,
     signals: Signals = None,
     rig: RigFile = None,
-    max_effects: MaxEffects = MAX_EFFECTS,
-    greedy: Greedy = False,
+    max_effects: MaxEffects = None,
+    greedy: Greedy = None,
     jobs: Jobs = _JOBS,
     dask: Dask = None,
     no_cache: NoCache = False,

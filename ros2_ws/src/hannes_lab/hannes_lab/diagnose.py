@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .adequacy import is_adequate
 from .chance import Chance, chance
-from .choose import MAX_EFFECTS, Choice, choose, choose_greedily, cut_to, tied_sets
+from .choose import MAX_EFFECTS, MAX_GREEDY, Choice, choose, choose_greedily, cut_to, tied_sets
 from .depends import residual_dependences
 from .diagnosis import Diagnosis, Fall, FoundEffect, ParameterEstimate
 from .errors import SignalError
@@ -27,7 +27,7 @@ from .fit import Fit
 from .prepare import Prepared
 from .screen import usable_effects
 from .search import Candidate, Progress, Search, key_of, silent
-from .wording import at_end_of_range, idle_sentence, notes, summary
+from .wording import idle_sentence, notes, summary
 
 Array = NDArray[np.float64]
 
@@ -68,15 +68,21 @@ def diagnose(
     jobs: int = 1,
     executor: Executor | None = None,
     progress: Progress = silent,
-    max_effects: int = MAX_EFFECTS,
-    greedy: bool = False,
+    max_effects: int | None = None,
+    greedy: bool | None = None,
 ) -> Diagnosis:
     """Search the catalogue; see the module docstrings of search, chance and problem for the method.
 
     executor  where the work is done, and where its results are kept; `jobs` processes if None
+    max_effects  effects that are named at most; MAX_EFFECTS, or MAX_GREEDY, if None
     greedy   add effects one after another as long as the error on held-out conditions falls (greedy.py), instead of
-             looking for the smallest set that explains all
+             looking for the smallest set that explains all; None: where no model has the machine's form
+             (Rig.foreign), and there are conditions to hold out
     """
+    if greedy is None:
+        greedy = prepared.rig.foreign and len(prepared.features.conditions) > 1
+    if max_effects is None:
+        max_effects = MAX_GREEDY if greedy else MAX_EFFECTS
     if not sources:
         raise HannesError(
             "There is no effect to look for: those that were named are in the model already, or none was named."
@@ -217,7 +223,7 @@ def found_effects(
 ) -> tuple[FoundEffect, ...]:
     """The effects of a fitted set with parameters, intervals and the reason."""
     intervals = intervals_of(best.fit, limits)
-    at_end = {c.name for c in at_end_of_range(best.fit)}
+    at_end = {c.name for c in best.fit.at_end}
     return tuple(_found(search, best.fit, name, intervals, at_end, falls) for name in best.names)
 
 

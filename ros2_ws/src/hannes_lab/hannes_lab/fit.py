@@ -64,6 +64,13 @@ class Fit:
         off = [(c, abs(float(z))) for c, z in zip(self.coordinates, self.z, strict=True) if c.prior]
         return sorted(off, key=lambda item: -item[1])
 
+    @property
+    def at_end(self) -> list[Coordinate]:
+        """The effects' parameters that would go beyond their range."""
+        return [
+            c for c, z in zip(self.coordinates, self.z, strict=True) if not c.prior and c.at_end(float(z))
+        ]
+
     def covariance(self, inflate: float = 1.0) -> Array:
         """Covariance (k, k) of z from the curvature at the optimum, with the priors.
 

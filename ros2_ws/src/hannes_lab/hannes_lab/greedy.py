@@ -20,8 +20,18 @@ JUDGED = 3
 POLISH_STEPS = 40
 """Limit on the steps of the last fit of each of them: valleys of friction laws are long."""
 
+AS_IT_REPEATS = 1.25
+"""An error on held-out conditions, in multiples of the repeatability, that leaves nothing to look for on a real
+machine: chance makes it 1, and up to this where five repeats differ by one parameter, such as their friction (95 % of
+(4 + chi-square of one degree) / 5, root).  What a model of the right form has of its own is less than its repeats."""
+
 ALIKE = 0.02
 """Candidates whose held-out error is this close to the best, as a part of it, tie with it."""
+
+
+HALF = 0.5
+"""An effect with a parameter whose interval reaches the end of its range joins only if it leaves this part of the mean
+square error at most: what takes its least or its greatest value stands for something else."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +65,7 @@ def held_out_error(search: Search, candidate: Candidate, quickly: bool = False) 
 def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grown:
     """Add effects until the mean square of the held-out error falls by less than the part `gain`, or none is left.
 
+    An error that the machine's own repeats explain is not looked into: what joined would be fitted to chance.
     The candidates of a round are compared quickly; whether the best of them joins is decided by refits of their own.
     """
     best = null
@@ -63,23 +74,31 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
     rivals: tuple[Candidate, ...] = ()
     notes: list[str] = []
     while len(best.names) < max_effects:
+        if errors[-1] <= AS_IT_REPEATS:
+            notes.append(
+                f"the held-out error of {errors[-1]:.2f} times the repeatability leaves nothing to look for (up to "
+                f"{AS_IT_REPEATS} it may be chance): the search stops here"
+            )
+            break
         text = f"effect {len(best.names) + 1}"
         singles = search.extend([best], list(search.sources), text)
         if not singles:
             break
         first = first or tuple(singles)
-        found = _judge(search, singles, text)
-        enough = math.sqrt(1.0 - gain)
-        if not found.error <= enough * errors[-1] and len(best.names) + 2 <= max_effects:
+        found = _judge(search, singles, text, best, gain)
+        if not found.falls(errors[-1]) and len(best.names) + 2 <= max_effects:
             # Two effects may be worth it of which neither is alone.
             pairs = search.extend(singles[:JUDGED], list(search.sources), f"{text}, as a pair")
-            two = _judge(search, pairs, text) if pairs else found
-            if two.error <= enough**2 * errors[-1]:
-                found, enough = two, enough**2
-        if not found.error <= enough * errors[-1]:
+            two = _judge(search, pairs, text, best, 1.0 - (1.0 - gain) ** 2) if pairs else found
+            if two.falls(errors[-1]):
+                found = two
+        if not found.falls(errors[-1]):
+            open_ended = found.open_ended
+            why = f", for the interval of {open_ended} reaches the end of its range" if open_ended else ""
             notes.append(
                 f"the next effect, {found.best.names[-1]}, would change the held-out error from {errors[-1]:.2f} to "
-                f"{found.error:.2f}; its mean square must fall by {100 * gain:.0f} %: the search stops here"
+                f"{found.error:.2f}; its mean square must fall by {100 * (1.0 - found.most):.0f} %{why}: the search "
+                "stops here"
             )
             break
         if rivals:
@@ -91,25 +110,58 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
 
 @dataclass(frozen=True)
 class _Judged:
+    """The best of some candidates, its held-out error, and those that are alike.
+
+    most    part of the mean square error without it that may be left if it is to join
+    open_ended  names of its new parameters of which the range, and not the data, gives one end
+    """
+
     best: Candidate
     error: float
     rivals: tuple[Candidate, ...]
+    most: float
+    open_ended: str = ""
+
+    def falls(self, before: float) -> bool:
+        """Whether the error is as much smaller than the one before as it must be."""
+        return self.error <= math.sqrt(self.most) * before
 
 
-def _judge(search: Search, candidates: Sequence[Candidate], text: str) -> _Judged:
-    """The best of the best fits by held-out error; of those that are alike, the one with the fewest parameters."""
+def _judge(
+    search: Search, candidates: Sequence[Candidate], text: str, base: Candidate, gain: float
+) -> _Judged:
+    """The best of the best fits by held-out error; of those that are alike, the one with the fewest parameters.
+
+    Each error counts in multiples of what it may be at most (HALF, or 1 - gain, of the mean square without it).
+    """
     judged = search.each(_polish_in_worker, [(c,) for c in candidates[:JUDGED]], f"{text}: polish")
     held = search.each(held_out_error, [(c, True) for c in judged], f"{text}: held-out conditions")
-    least = min(held)
-    alike = [k for k in range(len(judged)) if held[k] <= (1.0 + ALIKE) * least]
+    ends = [_open_ended(candidate, base) for candidate in judged]
+    most = [min(HALF, 1.0 - gain) if end else 1.0 - gain for end in ends]
+    scores = [error / math.sqrt(part) for error, part in zip(held, most, strict=True)]
+    least = min(scores)
+    alike = [k for k in range(len(judged)) if scores[k] <= (1.0 + ALIKE) * least]
     if not alike:
-        return _Judged(judged[0], float("nan"), ())
+        return _Judged(judged[0], float("nan"), (), 1.0 - gain)
     for candidate in judged:
         search.found[candidate.key] = candidate
-    winner = min(alike, key=lambda k: (len(judged[k].fit.coordinates), held[k]))
-    rivals = tuple(judged[k] for k in sorted(alike, key=lambda k: held[k]) if k != winner)
+    winner = min(alike, key=lambda k: (len(judged[k].fit.coordinates), scores[k]))
+    rivals = tuple(judged[k] for k in sorted(alike, key=lambda k: scores[k]) if k != winner)
     error = search.once(held_out_error, judged[winner], text=f"{text}: held-out conditions")
-    return _Judged(judged[winner], error, rivals)
+    return _Judged(judged[winner], error, rivals, most[winner], ends[winner])
+
+
+def _open_ended(candidate: Candidate, base: Candidate) -> str:
+    """Names of the parameters whose 95 % interval reaches the end of their range, of the effects beyond a base's."""
+    fit, new = candidate.fit, set(candidate.names) - set(base.names)
+    widths = 1.96 * fit.sd(max(1.0, fit.cost / fit.residual.size))
+    return ", ".join(
+        c.name
+        for c, z, width in zip(fit.coordinates, fit.z, widths, strict=True)
+        if c.name.split(".")[0] in new
+        and not c.part
+        and any(abs(z - end) <= width for end in c.bounds if end != 0.0)
+    )
 
 
 def _close_call(best: Candidate, rivals: Sequence[Candidate]) -> str:

@@ -26,7 +26,6 @@ import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 
-from .choose import MAX_EFFECTS
 from .cli import _JOBS, Bags, Greedy, Jobs, MaxEffects, ModelFile, Objects, RigFile, Scale, Signals, Topics
 from .page_guard import Guard, address_of
 from .page_worker import ANSWER, GRACE_S, MODEL, REPORT
@@ -324,8 +323,8 @@ def page(
     topics: Topics = None,
     signals: Signals = None,
     rig: RigFile = None,
-    max_effects: MaxEffects = MAX_EFFECTS,
-    greedy: Greedy = False,
+    max_effects: MaxEffects = None,
+    greedy: Greedy = None,
     jobs: Jobs = _JOBS,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port; 0: any that is free.")] = 0,
     host: Annotated[

@@ -177,8 +177,10 @@ def command_line(task: Mapping[str, Any]) -> str:
     for effect in task.get("effects") or () if action != "compare" else ():
         words += ["--only" if task.get("only") and action == "diagnose" else "--effect", effect]
     if action == "diagnose":
-        words += ["--greedy"] if task["greedy"] else []
-        words += ["--max-effects", str(task["max_effects"])]
+        if task["greedy"] is not None:
+            words += ["--greedy" if task["greedy"] else "--no-greedy"]
+        if task["max_effects"] is not None:
+            words += ["--max-effects", str(task["max_effects"])]
         words += ["--add"]
     return shlex.join([*words, "--report", REPORT])
 

@@ -15,7 +15,7 @@ from hannes_description.model import Model
 from hannes_sim.effect import call_own
 from scipy.special import ndtr
 
-from .adapter import check_trials, other_units
+from .adapter import check_rig, check_trials, other_units
 from .features import Features, build_features
 from .fit import fit
 from .grasp import with_seen_objects
@@ -48,11 +48,11 @@ class Prepared:
     notes: tuple[str, ...]
 
 
-def existing(given: str | Path) -> Path:
+def existing(given: str | Path, what: str = "bag") -> Path:
     """The path, if there is something at it."""
     path = Path(given)
     if not path.exists():
-        raise HannesError(f"No bag '{given}': the path does not exist.")
+        raise HannesError(f"No {what} '{given}': the path does not exist.")
     return path
 
 
@@ -127,7 +127,8 @@ def load_trials(
 
 def read_trials(rig: type[PlantRig], paths: Sequence[Path]) -> list[Trial]:
     """Trials of the files that a rig's adapter reads, checked."""
-    return check_trials(call_own(f"{rig.__name__}.read", rig.read, paths), rig.__name__)
+    found = call_own(f"{rig.__name__}.read", rig.read, [existing(path, "recording") for path in paths])
+    return check_trials(found, rig.__name__)
 
 
 def without_outliers(trial: Trial) -> Trial:
@@ -183,6 +184,8 @@ def prepare(
         trials = with_seen_objects(trials, model)
     rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
     check_parameters(rig, model)
+    strange = not isinstance(rig, HandRig)
+    told = check_rig(rig, model) if strange else []
     known = dict.fromkeys((*SIGNALS, "motor_effort", *(s for t in trials for s in t.signals)))
     present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
     unknown = [s for s in signals or () if s not in present]
@@ -199,8 +202,8 @@ def prepare(
     settled, found = settle(problem, found, moves=3)
     problem = build_problem(settled.rig, features, model, nuisances, found.values, problem.counts)
     notes = [f"{trial.name}: {note}" for trial in trials for note in trial.notes]
-    if not isinstance(rig, HandRig):
-        notes += other_units(rig, model, features)
+    if strange:
+        notes += told + other_units(rig, model, features)
         if model.base == Model.base:
             notes.append(
                 f"the parameters of model '{model.name}' are the Hannes hand's, for it names no others: give its model "

@@ -45,6 +45,9 @@ RESTS = 0.02
 HELD = 0.05
 """A reference rests within this part of its span from its rest value, which it has for so large a part of the time."""
 
+LEFT = 1e-3
+"""It leaves from where it was last within this part of its span from where it came nearest to its rest value."""
+
 LONGEST_GAP = 5.0
 """Steps of a signal without a sample that are bridged by interpolation."""
 
@@ -282,25 +285,39 @@ def _rest_value(values: Array) -> float:
 def find_closures(reference: Array, period: float, *, lead: float = 0.03) -> list[tuple[float, float]]:
     """Start and stop [s] of every stretch from one departure of the reference to the next.
 
-    A closure starts `lead` seconds before the reference has moved by 2 % of its span and lasts until the next one
-    starts (the rest after it belongs to it: the hand is still opening), at most as long again as its moving part.
+    A closure starts `lead` seconds before the reference leaves its rest, which is seen where it has moved by 2 % of its
+    span, and lasts until the next one starts (the rest after it belongs to it: the hand is still opening), at most as
+    long again as its moving part.
     A stretch in which the recording begins or ends while the reference moves is given with its end at its start: it is
     no closure.
     """
     span = float(np.ptp(reference))
     if span <= 0.0:
         return []
-    moving = np.abs(reference - _rest_value(reference)) > RESTS * span
-    starts = [(first * period, last * period) for first, last in _runs(moving) if last - first >= 3]
+    away = np.abs(reference - _rest_value(reference))
+    moves, before = [], 0
+    for first, last in _runs(away > RESTS * span):
+        if last - first >= 3:
+            left = first - _left(away[before : first + 1], span)
+            moves.append((left * period - lead, first * period, last * period))
+        before = last
+    end = (reference.size - 1) * period
     out = []
-    for k, (first, last) in enumerate(starts):
-        begin = first - lead
-        if first <= 0.0 or last >= (reference.size - 1) * period:
+    for k, (begin, seen, gone) in enumerate(moves):
+        if seen <= 0.0 or gone >= end:
             out.append((begin, begin))
             continue
-        end = starts[k + 1][0] - lead if k + 1 < len(starts) else (reference.size - 1) * period
-        out.append((begin, min(end, last + (last - first))))
+        until = moves[k + 1][0] if k + 1 < len(moves) else end
+        out.append((begin, min(until, gone + (gone - seen))))
     return out
+
+
+def _left(away: Array, span: float) -> int:
+    """Ticks from where the reference, so far from its rest value (n,), last rested to the last one.
+
+    A soft start is seen late, and what precedes it would count as the end of the closure before: of all but the last.
+    """
+    return away.size - 1 - int(np.flatnonzero(away <= away.min() + LEFT * span)[-1])
 
 
 def find_moves(reference: Array, period: float, *, slow: float = 0.1) -> list[tuple[float, float]]:

@@ -14,7 +14,7 @@ from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
 from .falls import NO_REPEATS, fall_sentence
 from .fit import Fit, fit
-from .problem import Coordinate, Problem, nuisance_coordinate
+from .problem import Problem, nuisance_coordinate
 from .rig import Nuisance
 from .search import FAR, PENALTY, Candidate, Search
 
@@ -196,17 +196,12 @@ def _inseparable(search: Search, experiments: Sequence[Experiment]) -> list[str]
     ]
 
 
-def at_end_of_range(found: Fit) -> list[Coordinate]:
-    """The effects' parameters that would go beyond their range."""
-    return [c for c, z in zip(found.coordinates, found.z, strict=True) if not c.prior and c.at_end(float(z))]
-
-
 def _ends(best: Candidate) -> list[str]:
     """The effects' parameters that the end of their range holds."""
     return [
         f"{c.name} lies at the end of its range ({c.lower:g} to {c.upper:g} {c.unit}): the true value may lie beyond "
         "it, or it is another effect of a similar form"
-        for c in at_end_of_range(best.fit)
+        for c in best.fit.at_end
     ]
 
 
