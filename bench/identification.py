@@ -186,6 +186,9 @@ def detection_factors(names: list[str], seed: int = 7) -> dict[str, float]:
             held = Fixed(prepared.problem, {f"{kind.name}.{n}": v for n, v in strength(name, factor)})
             found = fit(held, with_effect, base.coordinates, base.z, known=known, evaluations=8)
             if found.cost >= base.cost + DETECTABLE:
+                # The way to a parameter that takes all of it over may be longer.
+                found = fit(held, with_effect, base.coordinates, found.z, evaluations=12)
+            if found.cost >= base.cost + DETECTABLE:
                 break
             factor *= 1.25
         out[name] = min(factor, top)

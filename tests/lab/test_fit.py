@@ -75,17 +75,30 @@ def derivatives(problem: Curved, known: dict[str, np.ndarray], most: int = 10) -
     return found
 
 
-def test_a_step_teaches_the_derivatives_what_they_missed() -> None:
+def test_a_step_teaches_the_derivatives_half_of_what_they_missed() -> None:
     problem = Curved()
     taught = derivatives(problem, {})
+    before = taught.jacobian
     assert taught.fresh and problem.simulations == 2
     z = np.array([0.8, 0.85])
     after = taught.at(z, problem.at(z))
     assert problem.simulations == 2 and not taught.fresh
-    np.testing.assert_allclose(after @ (z - BEGIN), problem.at(z) - problem.at(BEGIN))
+    made, promised = problem.at(z) - problem.at(BEGIN), before @ (z - BEGIN)
+    np.testing.assert_allclose(after @ (z - BEGIN), 0.5 * (made + promised))
+    assert np.abs(made - promised).min() > 0.1
     taught.forget()
     taught.at(z, problem.at(z))
     assert problem.simulations == 4 and taught.fresh
+
+
+def test_what_moves_nothing_together_is_not_taught_to() -> None:
+    """The zero of a hand and those of its recordings: a fit would go far along what only their priors hold."""
+    alike = {"a": np.array([300.0, 50.0]), "b": np.array([-300.0, -50.0])}
+    taught = derivatives(Curved(), alike)
+    z = BEGIN + [0.5, 0.4]
+    after = taught.at(z, Curved.at(z))
+    assert np.abs(after[:, 0] - alike["a"]).max() > 10.0
+    np.testing.assert_allclose(after @ [1.0, 1.0], 0.0, atol=1e-9)
 
 
 def test_derivatives_that_promised_too_much_are_taken_anew_unless_they_are_known_or_enough_were() -> None:

@@ -26,7 +26,7 @@ from .features import data_used
 from .fit import Fit
 from .prepare import Prepared
 from .screen import usable_effects
-from .search import Candidate, Progress, Search, key_of, silent
+from .search import FAR, Candidate, Progress, Search, key_of, silent
 from .wording import idle_sentence, notes, summary
 
 Array = NDArray[np.float64]
@@ -98,9 +98,9 @@ def diagnose(
         executor=executor or Executor(jobs),
         progress=progress,
     )
-    null = search.null()
-    limits = chance(search.problem, null.fit, search.signatures(null))
-    choice = (choose_greedily if greedy else choose)(search, null, limits, max_effects)
+    null, choice = _chosen(search, greedy, max_effects)
+    if not greedy:
+        null, choice = _named_instead(null, choice, search, max_effects)
     search, best, limits = choice.search, choice.best, choice.limits
     prepared = replace(prepared, problem=search.problem)
     falls = error_falls(prepared, search, best, in_order=greedy)
@@ -143,6 +143,46 @@ def diagnose(
         model=fitted_model(prepared.model, search, best, limits),
         values=best.fit.values,
     )
+
+
+def _chosen(search: Search, greedy: bool, max_effects: int) -> tuple[Candidate, Choice]:
+    """The model as it is, fitted, and the set of effects that is the answer."""
+    null = search.null()
+    limits = chance(search.problem, null.fit, search.signatures(null))
+    return null, (choose_greedily if greedy else choose)(search, null, limits, max_effects)
+
+
+def _named_instead(
+    null: Candidate, choice: Choice, search: Search, max_effects: int
+) -> tuple[Candidate, Choice]:
+    """Name the effect that is the same thing as a parameter of the recordings which is far off in all that have it.
+
+    Where little is known of a recording, a parameter of its own takes the effect over (the damping of an object that
+    nobody described), and its prior charges less than an effect must gain.  So the search is made without that
+    parameter too, and is the answer where it explains all for less.
+    """
+    off = {c.name: farness for c, farness in choice.best.fit.off}
+    least: dict[str, float] = {}
+    for n in search.nuisances:
+        if n.effect and n.name in off:
+            least[n.effect] = min(off[n.name], least.get(n.effect, math.inf))
+    same = {effect for effect, farness in least.items() if farness > FAR} & set(search.sources)
+    same -= set(choice.best.names)
+    if not (same and choice.adequate):
+        return null, choice
+    rest = [n for n in search.nuisances if n.effect not in same]
+    other = replace(search, nuisances=rest, found={}, _nominal={}, _minima={}, _scans={}, _key="")
+    bare, instead = _chosen(other, False, max_effects)
+    if not (instead.adequate and same <= set(instead.best.names)):
+        return null, choice
+    if instead.best.penalised > choice.best.penalised:
+        return null, choice
+    held = ", ".join(n.name for n in search.nuisances if n.effect in same)
+    note = (
+        f"{held} would do the same, far outside what is usual (misfit with the priors {choice.best.penalised:.0f}, "
+        f"{instead.best.penalised:.0f} so): held at the nominal value here"
+    )
+    return bare, replace(instead, notes=(*instead.notes, note))
 
 
 def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple[Fall, ...]]:

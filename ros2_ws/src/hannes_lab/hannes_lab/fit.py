@@ -187,6 +187,9 @@ MISSED = 0.02
 missed the residual that they promised by this part of its squares: far from the end, what was learned in one place
 leads astray in the next."""
 
+TAUGHT = 0.5
+"""Part of what a step missed that the derivatives learn: some of it is roughness, and bends."""
+
 LEAST_GAIN = 0.1
 LITTLE_GAIN = 1e-3
 """By how much a fit must lower its cost after its derivatives were found, or it ends: a small part of the likelihood's
@@ -205,7 +208,9 @@ class Derivatives:
     """Derivatives (size, k) of the whitened residual along the way of a fit.
 
     By finite differences where the fit starts, and again after a step that led elsewhere than they promised.  Between,
-    each step teaches them what they missed (Broyden 1965), shared among the coordinates by how far they moved the data.
+    each step s, which changed the residual by d, teaches them half of what they missed (Broyden 1965, in the metric of
+    the data): J += (d - J s) (J s)^T J / (2 |J s|^2).  What moves the data alike is changed alike, and what moves
+    nothing together still does.
 
     known   derivatives by coordinate name with which to begin; these are only taught
     steps   of the finite differences, by coordinate name
@@ -249,13 +254,12 @@ class Derivatives:
             )
             self.fresh = True
         elif move.any():
-            change = residual - self.residual
-            weights = (self.jacobian**2).sum(axis=0)
-            whole = float(weights @ move**2)
+            change, along = residual - self.residual, self.jacobian @ move
+            whole = float(along @ along)
             # What a short step missed is the simulation's roughness.
             if whole > 0.0 and np.linalg.norm(change) > ROUGHNESS:
-                missed = change - self.jacobian @ move
-                self.jacobian = self.jacobian + np.outer(missed, weights * move / whole)
+                missed = TAUGHT * (change - along) / whole
+                self.jacobian = self.jacobian + np.outer(missed, along @ self.jacobian)
             self.fresh = False
         self.z, self.residual = z.copy(), residual
         return self.jacobian

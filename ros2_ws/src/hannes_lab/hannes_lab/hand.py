@@ -239,7 +239,8 @@ class HandRig(PlantRig):
                     if name == "object.stiffness" and not known and damping in plant.names:
                         place = f"{damping}@{trial.name}"
                         unit, width = _OBJECT_UNITS[damping], _UNKNOWN_DAMPING_SD
-                        out.append(Nuisance(place, plant.get(damping), width, True, 0.0, unit, WIDE_STEP))
+                        own = Nuisance(place, plant.get(damping), width, True, 0.0, unit, WIDE_STEP)
+                        out.append(replace(own, effect="object_damping"))
             elif name == _ZERO:
                 if sum(map(is_described, self.trials)) > 1:
                     out.append(Nuisance(HAND_ZERO, 0.0, sd, False, unit="rad"))

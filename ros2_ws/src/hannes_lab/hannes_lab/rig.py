@@ -63,6 +63,7 @@ class Nuisance:
     lower        least value, for a positive parameter on a linear scale
     apart        sd that the one of a recording may be from the mean over all recordings; beyond, no set of effects is
                  adequate
+    effect       effect of the catalogue that is the same thing, if there is one: a value that is far off is that effect
     """
 
     name: str
@@ -74,6 +75,7 @@ class Nuisance:
     step: float = 0.5
     lower: float = -math.inf
     apart: float = math.inf
+    effect: str = ""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.sd) and self.sd > 0.0):
