@@ -376,3 +376,23 @@ def test_repeats_that_a_coarse_sensor_shows_alike_are_known_to_the_rigs_floor(la
     cells = [c for c in json.loads(out)["cells"] if c["signal"] == "encoder_position"]
     least = [1e-5 * abs(float(b) - float(a)) * 1e-3 for c in cells for a, _, b, _ in [c["condition"].split()]]
     assert all(c["repeatability"] > 0.9 * floor for c, floor in zip(cells, least, strict=True))
+
+
+def test_a_payload_of_a_condition_is_added_to_what_is_fitted(lab: Lab) -> None:
+    """As docs/your-own-rig.md has it: the recording is of a mass without it."""
+    run = """def run(self, model, values, trial, reference):
+        j = values.get("motor.armature", model.parameters.value("motor.armature"))
+        return super().run(model, {**values, "motor.armature": j + trial.options["payload"]}, trial, reference)"""
+    less = ["value: 2.0", "value: 1.5"]
+    text = (lab.folder / "parameters.yaml").read_text()
+    assert less[0] in text
+
+    def error(payload: float) -> float:
+        code, out, err = lab(f"replace(t, options={{'payload': {payload}}})", "--json", more=run)
+        assert code == 0, err
+        return max(e["rmse"] for e in json.loads(out)["errors"] if e["unit"] == "N")
+
+    as_it_was = error(0.0)
+    assert error(0.5) > 3.0 * as_it_was
+    with_model(lab, armature=next(line for line in text.splitlines() if "armature" in line).replace(*less))
+    assert error(0.5) == pytest.approx(as_it_was, rel=1e-3)

@@ -19,7 +19,7 @@ from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from .hand import HandRig
+from .hand import HandRig, sensors_of
 from .surrogate import FAST_PLANT
 from .trials import Trial
 
@@ -132,7 +132,8 @@ def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:
     if "motor_current" in trial.signals:
         sampled = float(np.median(np.diff(trial.signals["encoder_position"][0])))
         span = max(SMOOTH, SAMPLES * sampled)
-        current = _still(phase, position, trial.mean_closure("motor_current", phase), span, model)
+        logged = trial.mean_closure("motor_current", phase)
+        current = _still(phase, position, logged, span, model, rectified=sensors_of(trial)["rectified"])
     else:
         kp, kd = (model.parameters.value(f"control.{n}") for n in ("kp", "damping"))
         ticks = np.arange(trial.reference.size) * trial.period
@@ -148,10 +149,13 @@ def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:
     return _advancing(q, current[rising[0] : top + 1])
 
 
-def _still(time: Array, position: Array, current: Array, span: float, model: Model) -> Array:
+def _still(
+    time: Array, position: Array, current: Array, span: float, model: Model, *, rectified: bool
+) -> Array:
     """The current (p,) A without what accelerates the nominal hand and what its viscous friction takes.
 
-    span  s over which the motion is smoothed (Savitzky-Golay filter of the third order)
+    span       s over which the motion is smoothed (Savitzky-Golay filter of the third order)
+    rectified  the logger lost the current's sign: it is negative where the nominal hand is braked by its motor
     """
     value = model.parameters.value
     step = float(time[1] - time[0])
@@ -159,13 +163,10 @@ def _still(time: Array, position: Array, current: Array, span: float, model: Mod
     velocity, acceleration = (savgol_filter(position, window, 3, deriv=k, delta=step) for k in (1, 2))
     inertia = value("motor.armature") * value("gear.ratio") ** 2 + value("hand.inertia")
     torque = inertia * acceleration + value("friction.viscous") * velocity
-    return np.asarray(savgol_filter(current, window, 3) - torque / _per_ampere(model))
-
-
-def _per_ampere(model: Model) -> float:
-    """Torque per ampere at the pulley, N.m/A."""
-    value = model.parameters.value
-    return value("motor.kt") * value("gear.ratio") * value("gear.efficiency")
+    smooth, (still, rate, per_ampere) = savgol_filter(current, window, 3), _nominal(model)
+    if rectified:
+        smooth = np.where(still + rate * position + torque < 0.0, -smooth, smooth)
+    return np.asarray(smooth - torque / per_ampere)
 
 
 def _advancing(position: Array, current: Array) -> tuple[Array, Array]:
@@ -182,7 +183,8 @@ def _nominal(model: Model) -> tuple[float, float, float]:
     """Torque of the free hand when closing slowly: at rest (N.m), per rad; and torque per ampere, at the pulley."""
     value = model.parameters.value
     still = value("friction.coulomb") + value("hand.coulomb") + value("hand.preload")
-    return still, value("hand.stiffness"), _per_ampere(model)
+    per_ampere = value("motor.kt") * value("gear.ratio") * value("gear.efficiency")
+    return still, value("hand.stiffness"), per_ampere
 
 
 def _seen(
