@@ -17,7 +17,7 @@ from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.executor import Executor
 from hannes_lab.features import compact_end
 from hannes_lab.fit import Fit
-from hannes_lab.grasp import _seen, with_seen_objects
+from hannes_lab.grasp import Curve, _seen, with_seen_objects
 from hannes_lab.hand import HandRig, outer_loop
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import load_trials, prepare
@@ -164,15 +164,20 @@ def test_a_slack_is_found_on_a_hand_of_half_the_friction(tmp_path: Path) -> None
     assert found.effects[0].parameters["slack"].value == pytest.approx(1.0, abs=0.3)
 
 
+def signed(q: np.ndarray, current: np.ndarray) -> Curve:
+    """The curve of a logger that keeps the current's sign."""
+    return Curve(q, current, current)
+
+
 def test_a_slow_closure_on_nothing_is_no_grasp_where_the_fast_one_brakes() -> None:
     """The fast hand's current falls before it arrives; the slow one's does not rise."""
     q = np.linspace(2.5, 12.5, 200)
     slow, braking = np.full(q.size, 0.26), np.interp(q, [9.5, 11.0], [0.30, -0.05])
     gripping = np.interp(q, [9.5, 11.0], [0.26, 0.80])
     nominal = (0.044, 0.0015, 0.21)
-    assert _seen((q, slow), [(q, braking)], nominal) is None
-    assert _seen((q, gripping), [(q, braking)], nominal) is not None
-    assert _seen((q, gripping), [(q, slow)], nominal) is not None
+    assert _seen(signed(q, slow), [signed(q, braking)], nominal) is None
+    assert _seen(signed(q, gripping), [signed(q, braking)], nominal) is not None
+    assert _seen(signed(q, gripping), [signed(q, slow)], nominal) is not None
 
 
 def test_a_quick_start_is_no_part_of_the_grasp() -> None:
@@ -180,7 +185,7 @@ def test_a_quick_start_is_no_part_of_the_grasp() -> None:
     q = np.linspace(2.5, 12.5, 200)
     free = np.full(q.size, 0.15)
     pressing = np.interp(q, [2.5, 5.0, 7.5, 12.0], [0.45, 0.20, 0.18, 0.50])
-    seen = _seen((q, pressing), [(q, free)], (0.044, 0.0015, 0.21))
+    seen = _seen(signed(q, pressing), [signed(q, free)], (0.044, 0.0015, 0.21))
     assert seen is not None
     stiffness, place = seen
     assert place == pytest.approx(7.2, abs=0.5) and stiffness == pytest.approx(0.21 * 0.32 / 4.5, rel=0.1)
@@ -192,8 +197,10 @@ def test_the_crest_of_a_ripple_is_no_object() -> None:
     slow = 0.22 + 0.003 * q + 0.05 * np.sin(19.0 * q)
     braking = np.interp(q, [2.5, 4.0, 12.5], [0.38, 0.16, 0.12])
     nominal = (0.02, 0.001, 0.21)
-    assert _seen((q, slow), [(q, braking)], nominal) is None
-    seen = _seen((q, slow + 0.08 * np.maximum(q - 8.0, 0.0)), [(q, braking), (q, slow)], nominal)
+    assert _seen(signed(q, slow), [signed(q, braking)], nominal) is None
+    seen = _seen(
+        signed(q, slow + 0.08 * np.maximum(q - 8.0, 0.0)), [signed(q, braking), signed(q, slow)], nominal
+    )
     assert seen is not None and seen[0] == pytest.approx(0.21 * 0.08, rel=0.5) and 7.0 < seen[1] < 9.5
 
 
@@ -202,7 +209,7 @@ def test_a_free_hand_takes_about_what_the_nominal_one_does() -> None:
     q = np.linspace(2.5, 12.5, 200)
     slow = 0.17 + 0.03 * np.maximum(q - 8.0, 0.0)
     braking = np.interp(q, [2.5, 5.0, 12.5], [0.57, 0.12, 0.10])
-    assert _seen((q, slow), [(q, braking)], (0.035, 0.0015, 0.21)) is None
+    assert _seen(signed(q, slow), [signed(q, braking)], (0.035, 0.0015, 0.21)) is None
 
 
 def closing(name: str, position: list[tuple[float, float]], current: list[tuple[float, float]]) -> Trial:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from hannes_description.model import Model
@@ -117,11 +118,20 @@ def _error(trial: Trial, model: Model) -> float:
     return total
 
 
-def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:
-    """Encoder position (p,) rad, increasing, and current (p,) A of the mean closing; None without an encoder.
+class Curve(NamedTuple):
+    """Encoder position (p,) rad, increasing, and the least and greatest current (p,) A of a mean closing."""
+
+    position: Array
+    least: Array
+    most: Array
+
+
+def closing_curve(trial: Trial, model: Model) -> Curve | None:
+    """The curve of the mean closing; None without an encoder.
 
     The current is that which a hand without inertia and viscous friction would have taken.  Where none is recorded,
-    that which the nominal controller would ask for if the hand stood still.
+    that which the nominal controller would ask for if the hand stood still.  A logger that rectifies loses its sign:
+    where the hand brakes, an object or its motor may brake it, and the current is between two values.
     """
     if "encoder_position" not in trial.signals:
         return None
@@ -133,29 +143,30 @@ def closing_curve(trial: Trial, model: Model) -> tuple[Array, Array] | None:
         sampled = float(np.median(np.diff(trial.signals["encoder_position"][0])))
         span = max(SMOOTH, SAMPLES * sampled)
         logged = trial.mean_closure("motor_current", phase)
-        current = _still(phase, position, logged, span, model, rectified=sensors_of(trial)["rectified"])
+        least, most = (
+            _still(phase, position, logged, span, model, braked=braked)
+            for braked in (not sensors_of(trial)["rectified"], True)
+        )
     else:
         kp, kd = (model.parameters.value(f"control.{n}") for n in ("kp", "damping"))
         ticks = np.arange(trial.reference.size) * trial.period
         reference = np.mean([np.interp(c.start + phase, ticks, trial.reference) for c in closures], axis=0)
-        current = np.convolve(
+        least = most = np.convolve(
             kp * (reference - position) - kd * np.gradient(position, phase), np.ones(9) / 9.0, "same"
         )
     top = int(np.argmax(position))
     rising = np.flatnonzero(position[: top + 1] > FREE_TRAVEL * position[top])
     if rising.size < 8:
         return None
-    q = np.maximum.accumulate(position[rising[0] : top + 1])
-    return _advancing(q, current[rising[0] : top + 1])
+    way = slice(rising[0], top + 1)
+    return _advancing(np.maximum.accumulate(position[way]), least[way], most[way])
 
 
-def _still(
-    time: Array, position: Array, current: Array, span: float, model: Model, *, rectified: bool
-) -> Array:
+def _still(time: Array, position: Array, current: Array, span: float, model: Model, *, braked: bool) -> Array:
     """The current (p,) A without what accelerates the nominal hand and what its viscous friction takes.
 
-    span       s over which the motion is smoothed (Savitzky-Golay filter of the third order)
-    rectified  the logger lost the current's sign: it is negative where the nominal hand is braked by its motor
+    span    s over which the motion is smoothed (Savitzky-Golay filter of the third order)
+    braked  the current is also without what brakes the hand
     """
     value = model.parameters.value
     step = float(time[1] - time[0])
@@ -163,20 +174,19 @@ def _still(
     velocity, acceleration = (savgol_filter(position, window, 3, deriv=k, delta=step) for k in (1, 2))
     inertia = value("motor.armature") * value("gear.ratio") ** 2 + value("hand.inertia")
     torque = inertia * acceleration + value("friction.viscous") * velocity
-    smooth, (still, rate, per_ampere) = savgol_filter(current, window, 3), _nominal(model)
-    if rectified:
-        smooth = np.where(still + rate * position + torque < 0.0, -smooth, smooth)
-    return np.asarray(smooth - torque / per_ampere)
+    if not braked:
+        torque = np.maximum(torque, 0.0)
+    return np.asarray(savgol_filter(current, window, 3) - torque / _nominal(model)[2])
 
 
-def _advancing(position: Array, current: Array) -> tuple[Array, Array]:
+def _advancing(position: Array, *currents: Array) -> Curve:
     """A curve of places (p,) that do not go back, each with its largest current: what made the hand go on from there.
 
     Where friction holds it, the current may be anything below that: a user who relaxes and pulls again moves nothing.
     """
     step = max(STANDS * float(position[-1] - position[0]), 1e-12)
     first = np.unique((position - position[0]) // step, return_index=True)[1]
-    return position[first], np.maximum.reduceat(current, first)
+    return Curve(position[first], *(np.maximum.reduceat(current, first) for current in currents))
 
 
 def _nominal(model: Model) -> tuple[float, float, float]:
@@ -188,26 +198,28 @@ def _nominal(model: Model) -> tuple[float, float, float]:
 
 
 def _seen(
-    own: tuple[Array, Array] | None,
-    others: Sequence[tuple[Array, Array] | None],
+    own: Curve | None,
+    others: Sequence[Curve | None],
     nominal: tuple[float, float, float],
 ) -> tuple[float, float] | None:
     """Stiffness at the pulley (N.m/rad) and place (rad) of what a closing curve shows more than the others."""
     if own is None:
         return None
-    q, current = own
+    q, sure, current = own
     still, rate, per_ampere = nominal
     free = (still + rate * q) / per_ampere
     peak = int(np.argmax(current))
     factor, base = EXCESS_OVER_NOMINAL, free
     for other in others:
-        if other is None or other[0][-1] < q[peak]:
+        if other is None or other.position[-1] < q[peak]:
             continue
         # Where it brakes before it arrives, its current says less than what moves the hand.
-        there = np.maximum(np.interp(q, *other), np.median(other[1]))
+        there = np.maximum(np.interp(q, other.position, other.most), np.median(other.most))
         if factor > EXCESS[0] or there[peak] < base[peak]:
             factor, base = EXCESS[0], there
     least = max(base[peak], LEAST_FREE * free[peak])
+    if base is free and sure[peak] < factor * least + EXCESS[1]:
+        return None
     if current[peak] - _ripple(q[: peak + 1], current[: peak + 1]) < factor * least + EXCESS[1]:
         return None
     excess = (current - base)[: peak + 1]

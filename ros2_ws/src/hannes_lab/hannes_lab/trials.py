@@ -46,7 +46,7 @@ HELD = 0.05
 """A reference rests within this part of its span from its rest value, which it has for so large a part of the time."""
 
 LEFT = 1e-3
-"""It leaves from where it was last within this part of its span from where it came nearest to its rest value."""
+"""It leaves from where it was last within this part of its span, or its own noise, from where it mostly rests."""
 
 LONGEST_GAP = 5.0
 """Steps of a signal without a sample that are bridged by interpolation."""
@@ -317,7 +317,9 @@ def _left(away: Array, span: float) -> int:
 
     A soft start is seen late, and what precedes it would count as the end of the closure before: of all but the last.
     """
-    return away.size - 1 - int(np.flatnonzero(away <= away.min() + LEFT * span)[-1])
+    rest = float(np.median(away))
+    noise = 1.4826 * float(np.median(np.abs(away - rest)))
+    return away.size - 1 - int(np.flatnonzero(away <= rest + max(LEFT * span, 3.0 * noise))[-1])
 
 
 def find_moves(reference: Array, period: float, *, slow: float = 0.1) -> list[tuple[float, float]]:
