@@ -206,6 +206,15 @@ def test_the_command_of_the_answer_names_the_topics() -> None:
     assert page_worker.command_line(task) == said
 
 
+def test_the_command_of_the_answer_leaves_out_what_was_left_out() -> None:
+    task = {**settings("bags"), "action": "diagnose", "max_effects": None, "greedy": None}
+    assert page_worker.command_line(task) == "hannes diagnose bags --add --report report.html"
+    assert "--no-greedy --max-effects 2" in page_worker.command_line(
+        {**task, "greedy": False, "max_effects": 2}
+    )
+    assert "--greedy" in page_worker.command_line({**task, "greedy": True}).split()
+
+
 def files_of(work: Work) -> dict[str, Path]:
     assert work.answer is not None, work.problem
     return {name: work.answer["folder"] / name for name in work.answer["files"]}

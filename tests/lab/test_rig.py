@@ -307,7 +307,7 @@ def test_an_effect_at_the_end_of_its_range_must_take_half_of_the_error(
     monkeypatch.setattr(
         "hannes_lab.greedy._open_ended", lambda c, base: "cogging.period" if c.names[-1] == "cogging" else ""
     )
-    monkeypatch.setattr("hannes_lab.greedy.HALF", 0.9 * (after / before) ** 2)
+    monkeypatch.setattr("hannes_lab.greedy.OPEN_ENDED", 0.9 * (after / before) ** 2)
     cut = diagnose(prepared, only)
     assert [effect.name for effect in cut.effects] == ["coulomb_friction"]
     assert any(
@@ -331,3 +331,29 @@ def test_a_parameter_of_which_the_range_gives_one_end_is_open_ended() -> None:
     assert named(0.5, 10.0) == "" and named(0.5, 3.0) == length and named(0.0, 100.0) == length
     assert named(2.5, 1.0) == "", "a strength may be nought"
     assert named(0.0, 100.0, ("presliding_friction",)) == "", "it was there before"
+
+
+@pytest.mark.parametrize("kept", ["one condition", "one closure of each", "of this simulator"])
+def test_where_nothing_can_be_held_out_the_smallest_set_that_explains_all_is_looked_for(
+    recording: Path, kept: str
+) -> None:
+    """And of recordings of the simulator's own form; effects one after another are the rule for all others."""
+    rig = load_rig(ADAPTER)
+    (trial,) = rig.read([recording])
+    first = trial.conditions[0]
+    closures = {
+        "one condition": [c for c in trial.closures if c.condition == first],
+        "one closure of each": [trial.of(condition)[0] for condition in trial.conditions],
+        "of this simulator": trial.closures,
+    }
+    made = rig if kept != "of this simulator" else type("Own", (rig,), {"foreign": False})
+    prepared = prepare([trial.only(closures[kept])], Model.load(recording.parent / "mass.yaml"), rig=made)
+    texts = set[str]()
+    sources = effect_sources(only=["coulomb_friction"])
+    found = diagnose(prepared, sources, progress=lambda done, total, text: texts.add(text))
+    assert [effect.name for effect in found.effects] == ["coulomb_friction"]
+    assert any(text.startswith("one effect") for text in texts)
+    assert not any("held-out conditions" in text for text in texts)
+    if kept != "of this simulator":
+        with pytest.raises(HannesError, match="--no-greedy"):
+            diagnose(prepared, sources, greedy=True)

@@ -141,7 +141,7 @@ def test_what_read_returns_must_be_trials(lab: Lab, read: str, said: str) -> Non
         ("closures(t, lambda c: (c.start, c.stop))", "closure 1 is a tuple"),
         ("replace(t, reference=t.reference[:5000])", "but the reference from 0 to 4.999 s"),
         ("position(t, lambda x, y: (x[::800], y[::800]))", "has a sample every 0.8 s, but a closure lasts"),
-        ("closures(t, lambda c: replace(c, condition='lap'))", "both 'lap', but their references are 0.0289 m apart"),
+        ("closures(t, lambda c: replace(c, condition='lap'))", "both 'lap', but their references are 0.0289 apart"),
     ],
 )  # fmt: skip
 def test_a_recording_that_cannot_be_replayed_is_refused(lab: Lab, change: str, said: str) -> None:

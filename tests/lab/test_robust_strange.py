@@ -212,6 +212,19 @@ def test_a_free_hand_takes_about_what_the_nominal_one_does() -> None:
     assert _seen(signed(q, slow), [signed(q, braking)], (0.035, 0.0015, 0.21)) is None
 
 
+def test_what_brakes_a_hand_is_no_object_where_the_current_has_no_sign() -> None:
+    """At the end of a quick way, beyond where others come, an object or the motor may brake it."""
+    q = np.linspace(2.5, 13.4, 200)
+    free, braked = np.full(q.size, 0.25), np.interp(q, [10.5, 13.4], [0.25, 0.9])
+    shorter = Curve(q[:170], free[:170], free[:170])
+    nominal = (0.044, 0.0015, 0.21)
+    assert _seen(Curve(q, free, braked), [shorter], nominal) is None
+    assert _seen(signed(q, braked), [shorter], nominal) is not None
+    assert _seen(Curve(q, free, braked), [signed(q, free)], nominal) is not None, (
+        "another came as far without"
+    )
+
+
 def closing(name: str, position: list[tuple[float, float]], current: list[tuple[float, float]]) -> Trial:
     """A recording of one closure: position by time, rounded over 0.2 s; current by time, without what inertia takes."""
     value = Model.load().parameters.value

@@ -135,18 +135,37 @@ def test_grouping_ignores_small_differences_only() -> None:
     assert len(spans) == 4 and len(kinds) == 2
 
 
+def soft_moves(seconds: float, rest: float, count: int = 5) -> np.ndarray:
+    """Minimum-jerk moves to 1 and back, each after a rest, from one of 0.5 s on."""
+    u = np.linspace(0.0, 1.0, round(1e3 * seconds))
+    rise = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
+    still = np.zeros(round(1e3 * rest))
+    closure = np.concatenate([still, rise, np.ones(300), 1.0 - rise])
+    return np.concatenate([np.zeros(500), np.tile(closure, count), still])
+
+
 def test_a_closure_ends_before_the_next_one_leaves_its_rest() -> None:
     """A soft start is seen late: in all closures but the last the next one's would be the end of it."""
-    u = np.linspace(0.0, 1.0, 1000)
-    rise = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
-    closure = np.concatenate([np.zeros(500), rise, np.ones(300), 1.0 - rise, np.zeros(200)])
-    for rest in (0.0, 0.4):
-        reference = rest + 5.0 * np.tile(closure, 4)
+    for where in (0.0, 0.4):
+        reference = where + 5.0 * soft_moves(1.0, 0.7)
         spans = find_closures(reference, 1e-3)
-        assert len(spans) == 4
+        assert len(spans) == 5
         for start, stop in spans:
             ends = reference[[round(1e3 * start), min(round(1e3 * stop), reference.size - 1)]]
-            assert ends == pytest.approx(rest, abs=5e-3)
-        assert [start for start, _ in spans] == pytest.approx([0.5 + 3.0 * k for k in range(4)], abs=0.05)
-    never_still = reference + 0.01 * np.sin(np.arange(reference.size))
-    assert len(find_closures(never_still, 1e-3)) == 4
+            assert ends == pytest.approx(where, abs=5e-3)
+        assert [start for start, _ in spans] == pytest.approx([1.2 + 3.0 * k for k in range(5)], abs=0.05)
+
+
+@pytest.mark.parametrize("noise", [2e-4, 1e-3])
+@pytest.mark.parametrize(("seconds", "rest"), [(0.5, 0.1), (0.5, 2.0), (1.0, 0.7), (3.0, 0.3), (3.0, 2.0)])
+def test_noise_of_the_reference_makes_no_further_closures_or_conditions(
+    seconds: float, rest: float, noise: float
+) -> None:
+    """While it leaves its rest slowly, it crosses any limit many times."""
+    clean = soft_moves(seconds, rest)
+    reference = 10.0 * (clean + noise * np.random.default_rng(1).standard_normal(clean.size))
+    spans = find_closures(reference, 1e-3)
+    closures = group_closures(reference, 1e-3, spans, "soft")
+    assert len(closures) == 5 and {c.condition for c in closures} == {"soft"}
+    every = 2.0 * seconds + 0.3 + rest
+    assert np.diff([start for start, _ in spans]) == pytest.approx(every, abs=0.015)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from .features import Features, kind_of, stands_for_all
 from .rig import REFERENCE_SIZES, PlantRig, Rig
 from .trials import EARLY, Closure, NoClosure, Part, Trial, has_gap, left_out, unique_names
-from .units import AGAINST, ENCODER, FOLLOWS, follows
+from .units import AGAINST, ENCODER, FOLLOWS, STANDS, follows
 
 Array = NDArray[np.float64]
 Samples = tuple[Array, Array]
@@ -51,7 +51,8 @@ def check_rig(rig: Rig, model: Model) -> list[str]:
         return []
     who, sizes = type(rig).__name__, dict(rig.sizes)
     for token, size in sizes.items():
-        if token not in REFERENCE_SIZES or not (isinstance(size, int | float) and 0.0 < size < math.inf):
+        number = isinstance(size, int | float | np.number) and not isinstance(size, bool)
+        if token not in REFERENCE_SIZES or not (number and 0.0 < float(size) < math.inf):
             raise HannesError(
                 f"{who}.sizes: '{token}': {size!r}; it takes positive numbers for {', '.join(REFERENCE_SIZES)} (on a "
                 "linear machine too, where they count as N and m)."
@@ -247,11 +248,11 @@ def _check_repeats(trial: Trial, where: str) -> None:
             one, two = (np.interp(c.start + phase, ticks, trial.reference) for c in (first, other))
             span = max(float(np.ptp(one)), float(np.ptp(two)))
             apart = float(np.abs(one - two).mean())
-            if apart > OTHER_MOVE * span:
+            if apart > OTHER_MOVE * max(span, STANDS * trial.span):
                 raise HannesError(
                     f"{where}: the closures at {first.start:.6g} and {other.start:.6g} s are both '{condition}', but "
-                    f"their references are {apart:.3g} {trial.unit(ENCODER)} apart in the mean and go over {span:.3g}: "
-                    "they do not repeat one another. Give each move, and each direction, a condition of its own."
+                    f"their references are {apart:.3g} apart in the mean and go over {span:.3g}: they do not repeat "
+                    "one another. Give each move, and each direction, a condition of its own."
                 )
 
 

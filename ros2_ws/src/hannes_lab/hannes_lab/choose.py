@@ -11,6 +11,7 @@ from hannes_description.errors import HannesError
 from .adequacy import is_adequate, shortfall
 from .chance import Chance, chance
 from .diagnosis import Rank
+from .features import Features
 from .greedy import AS_IT_REPEATS, grow
 from .search import HOPELESS, PENALTY, Candidate, Search, key_of
 
@@ -42,6 +43,8 @@ repeatability, falls to this part; where more is left, what is missing is someth
 MAX_EFFECTS = 3
 MAX_GREEDY = 7
 """Most effects that are named, by the smallest set that explains all and one after another."""
+
+COUNTS = {1: "one", 2: "two", 3: "three"}
 
 WIDE = (4, 3)
 """How many of the best singles and pairs are extended by every further effect."""
@@ -84,7 +87,6 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
     """
     choice = Choice(search, null, limits, is_adequate(search, null, limits), ())
     front, far = [null], list[Candidate]()
-    texts = ("one effect", "two effects", "three effects")
     for size in range(1, max_effects + 1):
         enough = is_adequate(choice.search, choice.best, choice.limits, room=1.0)
         if enough and size > 1:
@@ -92,7 +94,8 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
             front, far = [c for c in front if c.penalised <= front[0].penalised + room], []
         needed = needed_gain(choice, choice.best, first=size == 1)
         worth = choice.best.penalised - 0.5 * needed
-        round_ = _extended(choice, front, far, texts[size - 1], worth)
+        text = f"{COUNTS.get(size, size)} effect{'s' * (size > 1)}"
+        round_ = _extended(choice, front, far, text, worth)
         if not round_:
             break
         if size == 1 and _hard(choice, round_[0]):
@@ -131,12 +134,22 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
     return pruned(choice)
 
 
+def can_be_held_out(features: Features) -> bool:
+    """Whether the error on conditions that are left out can be judged: there are two, and repeats to judge it by."""
+    return len(features.conditions) > 1 and any(block.n > 1 for block in features.blocks)
+
+
 def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects: int) -> Choice:
     """Effects one after another while the mean square error on held-out conditions falls by at least WORTHWHILE."""
-    if len(search.problem.features.conditions) < 2:
+    features = search.problem.features
+    if not can_be_held_out(features):
+        why = (
+            "and there is one condition only: record another speed or load"
+            if len(features.conditions) < 2
+            else "in multiples of the repeatability, and there are no repeats: record each motion more than once"
+        )
         raise HannesError(
-            "--greedy judges by conditions that took no part in the fit, and there is one condition only: record "
-            "another speed or load, or leave --greedy out."
+            f"--greedy judges by conditions that took no part in the fit, {why}, or say --no-greedy."
         )
     grown = grow(search, null, max_effects, WORTHWHILE)
     adequate = is_adequate(search, grown.best, limits)

@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from .adequacy import is_adequate
 from .chance import Chance, chance
-from .choose import MAX_EFFECTS, MAX_GREEDY, Choice, choose, choose_greedily, cut_to, tied_sets
+from .choose import (
+    MAX_EFFECTS,
+    MAX_GREEDY,
+    Choice,
+    can_be_held_out,
+    choose,
+    choose_greedily,
+    cut_to,
+    tied_sets,
+)
 from .depends import residual_dependences
 from .diagnosis import Diagnosis, Fall, FoundEffect, ParameterEstimate
 from .errors import SignalError
@@ -77,10 +86,10 @@ def diagnose(
     max_effects  effects that are named at most; MAX_EFFECTS, or MAX_GREEDY, if None
     greedy   add effects one after another as long as the error on held-out conditions falls (greedy.py), instead of
              looking for the smallest set that explains all; None: where no model has the machine's form
-             (Rig.foreign), and there are conditions to hold out
+             (Rig.foreign), and there are repeats of two conditions or more
     """
     if greedy is None:
-        greedy = prepared.rig.foreign and len(prepared.features.conditions) > 1
+        greedy = prepared.rig.foreign and can_be_held_out(prepared.features)
     if max_effects is None:
         max_effects = MAX_GREEDY if greedy else MAX_EFFECTS
     if not sources:
@@ -159,9 +168,10 @@ def _named_instead(
 
     Where little is known of a recording, a parameter of its own takes the effect over (the damping of an object that
     nobody described), and its prior charges less than an effect must gain.  So the search is made without that
-    parameter too, and is the answer where it explains all for less.
+    parameter too, and is the answer where it explains all for less.  An effect adds to the nominal value: only what is
+    far above it counts.
     """
-    off = {c.name: farness for c, farness in choice.best.fit.off}
+    off = choice.best.fit.point
     least: dict[str, float] = {}
     for n in search.nuisances:
         if n.effect and n.name in off:
@@ -175,12 +185,15 @@ def _named_instead(
     bare, instead = _chosen(other, False, max_effects)
     if not (instead.adequate and same <= set(instead.best.names)):
         return null, choice
-    if instead.best.penalised > choice.best.penalised:
+    # Noise is estimated at each of the two: they are compared with that of the same one.
+    again = replace(choice.best, fit=instead.search.refit(choice.best.fit))
+    before = choice.best.penalised - choice.best.fit.cost + again.fit.cost
+    if instead.best.penalised > before:
         return null, choice
     held = ", ".join(n.name for n in search.nuisances if n.effect in same)
     note = (
-        f"{held} would do the same, far outside what is usual (misfit with the priors {choice.best.penalised:.0f}, "
-        f"{instead.best.penalised:.0f} so): held at the nominal value here"
+        f"{held} would do the same, far outside what is usual (misfit, with what priors and parameters charge, "
+        f"{before:.0f} instead of {instead.best.penalised:.0f}): held at the nominal value here"
     )
     return bare, replace(instead, notes=(*instead.notes, note))
 

@@ -119,10 +119,14 @@ def _error(trial: Trial, model: Model) -> float:
 
 
 class Curve(NamedTuple):
-    """Encoder position (p,) rad, increasing, and the least and greatest current (p,) A of a mean closing."""
+    """Encoder position (p,) rad, increasing, and current (p,) A of a mean closing.
+
+    current  without what drives the hand on; and without what brakes it where the logger tells its sign
+    most     without what brakes it in any case: as if an object did
+    """
 
     position: Array
-    least: Array
+    current: Array
     most: Array
 
 
@@ -131,7 +135,7 @@ def closing_curve(trial: Trial, model: Model) -> Curve | None:
 
     The current is that which a hand without inertia and viscous friction would have taken.  Where none is recorded,
     that which the nominal controller would ask for if the hand stood still.  A logger that rectifies loses its sign:
-    where the hand brakes, an object or its motor may brake it, and the current is between two values.
+    where the hand brakes, an object or its motor may brake it.
     """
     if "encoder_position" not in trial.signals:
         return None
@@ -143,7 +147,7 @@ def closing_curve(trial: Trial, model: Model) -> Curve | None:
         sampled = float(np.median(np.diff(trial.signals["encoder_position"][0])))
         span = max(SMOOTH, SAMPLES * sampled)
         logged = trial.mean_closure("motor_current", phase)
-        least, most = (
+        current, most = (
             _still(phase, position, logged, span, model, braked=braked)
             for braked in (not sensors_of(trial)["rectified"], True)
         )
@@ -151,7 +155,7 @@ def closing_curve(trial: Trial, model: Model) -> Curve | None:
         kp, kd = (model.parameters.value(f"control.{n}") for n in ("kp", "damping"))
         ticks = np.arange(trial.reference.size) * trial.period
         reference = np.mean([np.interp(c.start + phase, ticks, trial.reference) for c in closures], axis=0)
-        least = most = np.convolve(
+        current = most = np.convolve(
             kp * (reference - position) - kd * np.gradient(position, phase), np.ones(9) / 9.0, "same"
         )
     top = int(np.argmax(position))
@@ -159,7 +163,7 @@ def closing_curve(trial: Trial, model: Model) -> Curve | None:
     if rising.size < 8:
         return None
     way = slice(rising[0], top + 1)
-    return _advancing(np.maximum.accumulate(position[way]), least[way], most[way])
+    return _advancing(np.maximum.accumulate(position[way]), current[way], most[way])
 
 
 def _still(time: Array, position: Array, current: Array, span: float, model: Model, *, braked: bool) -> Array:

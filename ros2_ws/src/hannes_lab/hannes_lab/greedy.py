@@ -29,7 +29,7 @@ ALIKE = 0.02
 """Candidates whose held-out error is this close to the best, as a part of it, tie with it."""
 
 
-HALF = 0.5
+OPEN_ENDED = 0.5
 """An effect with a parameter whose interval reaches the end of its range joins only if it leaves this part of the mean
 square error at most: what takes its least or its greatest value stands for something else."""
 
@@ -132,12 +132,12 @@ def _judge(
 ) -> _Judged:
     """The best of the best fits by held-out error; of those that are alike, the one with the fewest parameters.
 
-    Each error counts in multiples of what it may be at most (HALF, or 1 - gain, of the mean square without it).
+    Each error counts in multiples of what it may be at most (OPEN_ENDED, or 1 - gain, of the mean square without it).
     """
     judged = search.each(_polish_in_worker, [(c,) for c in candidates[:JUDGED]], f"{text}: polish")
     held = search.each(held_out_error, [(c, True) for c in judged], f"{text}: held-out conditions")
     ends = [_open_ended(candidate, base) for candidate in judged]
-    most = [min(HALF, 1.0 - gain) if end else 1.0 - gain for end in ends]
+    most = [min(OPEN_ENDED, 1.0 - gain) if end else 1.0 - gain for end in ends]
     scores = [error / math.sqrt(part) for error, part in zip(held, most, strict=True)]
     least = min(scores)
     alike = [k for k in range(len(judged)) if scores[k] <= (1.0 + ALIKE) * least]
@@ -146,7 +146,8 @@ def _judge(
     for candidate in judged:
         search.found[candidate.key] = candidate
     winner = min(alike, key=lambda k: (len(judged[k].fit.coordinates), scores[k]))
-    rivals = tuple(judged[k] for k in sorted(alike, key=lambda k: scores[k]) if k != winner)
+    others = [k for k in alike if k != winner and most[k] == most[winner]]
+    rivals = tuple(judged[k] for k in sorted(others, key=lambda k: held[k]))
     error = search.once(held_out_error, judged[winner], text=f"{text}: held-out conditions")
     return _Judged(judged[winner], error, rivals, most[winner], ends[winner])
 
@@ -158,9 +159,7 @@ def _open_ended(candidate: Candidate, base: Candidate) -> str:
     return ", ".join(
         c.name
         for c, z, width in zip(fit.coordinates, fit.z, widths, strict=True)
-        if c.name.split(".")[0] in new
-        and not c.part
-        and any(abs(z - end) <= width for end in c.bounds if end != 0.0)
+        if c.name.split(".")[0] in new and c.at_end(float(z), width)
     )
 
 

@@ -101,14 +101,16 @@ class Coordinate:
         high = np.inf if not np.isfinite(self.upper) else self.z(self.upper)
         return low, high
 
-    def at_end(self, z: float) -> bool:
-        """True close to an end of a finite range, other than where an effect is switched off or a part is all of it."""
+    def at_end(self, z: float, near: float | None = None) -> bool:
+        """True close to an end of the range, other than where an effect is switched off or a part is all of it.
+
+        near  how close; AT_END of a finite range if None
+        """
         low, high = self.bounds
-        near = AT_END * (high - low)
-        return (
-            bool(np.isfinite(near))
-            and not self.part
-            and any(abs(z - end) <= near for end in (low, high) if end != 0.0)
+        if near is None:
+            near = AT_END * (high - low) if np.isfinite(high - low) else -1.0
+        return not self.part and any(
+            abs(z - end) <= near for end in (low, high) if end != 0.0 and np.isfinite(end)
         )
 
 

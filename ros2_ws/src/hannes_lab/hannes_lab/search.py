@@ -451,6 +451,10 @@ class Search:
             _key="",
         )
 
+    def refit(self, found: Fit) -> Fit:
+        """A fit of another problem, perhaps with other nuisance parameters, carried on in this one."""
+        return self._again(found, 8)
+
     def _refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
         """A candidate of another problem (other noise), fitted in this one from its point."""
         return _candidate(candidate.names, self._led_back(self._again(candidate.fit, evaluations)))

@@ -45,8 +45,14 @@ RESTS = 0.02
 HELD = 0.05
 """A reference rests within this part of its span from its rest value, which it has for so large a part of the time."""
 
+MOVES = 0.04
+"""It moves where it goes beyond this part of its span: noise crosses the limit of rest many times while it leaves."""
+
+ALIKE = 0.1
+"""Closures of which the moving parts differ in length by less than this part are taken to leave their rest alike."""
+
 LEFT = 1e-3
-"""It leaves from where it was last within this part of its span, or its own noise, from where it mostly rests."""
+"""It leaves from where it was last within this part of its span, or its own noise, of where it rests."""
 
 LONGEST_GAP = 5.0
 """Steps of a signal without a sample that are bridged by interpolation."""
@@ -295,31 +301,52 @@ def find_closures(reference: Array, period: float, *, lead: float = 0.03) -> lis
     if span <= 0.0:
         return []
     away = np.abs(reference - _rest_value(reference))
-    moves, before = [], 0
-    for first, last in _runs(away > RESTS * span):
-        if last - first >= 3:
-            left = first - _left(away[before : first + 1], span)
-            moves.append((left * period - lead, first * period, last * period))
-        before = last
+    runs = [
+        (first, last)
+        for first, last in _runs(away > RESTS * span)
+        if last - first >= 3 and away[first : last + 1].max() > MOVES * span
+    ]
+    begins = [0, *(last for _, last in runs)]
+    rests = [away[begin : first + 1] for begin, (first, _) in zip(begins, runs, strict=False)]
+    level = _rest_level(rests, span)
     end = (reference.size - 1) * period
+    since = np.array([_since(rest, level) for rest in rests])
+    lengths = np.array([last - first for first, last in runs])
+    # Of closures that last alike together: noise moves the one much, and the crossing of 2 % hardly.
+    alike = [np.abs(lengths - length) <= ALIKE * length for length in lengths]
+    starts = [
+        (first - float(np.median(since[own]))) * period - lead
+        for (first, _), own in zip(runs, alike, strict=True)
+    ]
     out = []
-    for k, (begin, seen, gone) in enumerate(moves):
+    for k, (first, last) in enumerate(runs):
+        seen, gone = first * period, last * period
         if seen <= 0.0 or gone >= end:
-            out.append((begin, begin))
+            out.append((starts[k], starts[k]))
             continue
-        until = moves[k + 1][0] if k + 1 < len(moves) else end
-        out.append((begin, min(until, gone + (gone - seen))))
+        until = starts[k + 1] if k + 1 < len(runs) else end
+        out.append((starts[k], min(until, gone + (gone - seen))))
     return out
 
 
-def _left(away: Array, span: float) -> int:
-    """Ticks from where the reference, so far from its rest value (n,), last rested to the last one.
+def _rest_level(rests: Sequence[Array], span: float) -> float:
+    """How far from its rest value a reference may be that rests, by the stretches in which it does.
+
+    One level for all: closures that repeat each other begin at the same place.
+    """
+    if not rests:
+        return 0.0
+    low, middle = np.quantile(np.concatenate(rests), (0.1, 0.5))
+    return float(low + max(LEFT * span, 3.0 * (middle - low)))
+
+
+def _since(rest: Array, level: float) -> int:
+    """Ticks from where a reference, so far from its rest value (n,), was last within a level to the last one.
 
     A soft start is seen late, and what precedes it would count as the end of the closure before: of all but the last.
     """
-    rest = float(np.median(away))
-    noise = 1.4826 * float(np.median(np.abs(away - rest)))
-    return away.size - 1 - int(np.flatnonzero(away <= rest + max(LEFT * span, 3.0 * noise))[-1])
+    within = np.flatnonzero(rest <= max(level, float(rest.min())))
+    return rest.size - 1 - int(within[-1])
 
 
 def find_moves(reference: Array, period: float, *, slow: float = 0.1) -> list[tuple[float, float]]:

@@ -45,7 +45,7 @@ STANDS = 0.05
 """Range of an encoder over that of its reference up to which it does not move with or against it."""
 
 AGAINST = -0.5
-"""Correlation of encoder and reference below which they move against each other."""
+"""Correlation of encoder and reference, or of a signal and its simulation, below which they go against each other."""
 
 FREE = 0.7
 """The same in a free closure, at least: some recording must reach it before the encoder's unit is taken for another."""

@@ -54,7 +54,7 @@ def summary(
             "repeatability"
         )
         other = choice.idle and f", though {choice.idle}"
-        if not other and choice.adequate:
+        if not other and choice.adequate and choice.ranking:
             other = ", and no effect of the catalogue gains more than chance would"
         held = (
             f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability."
