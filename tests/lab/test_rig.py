@@ -14,7 +14,7 @@ from hannes_description.model import Model
 from hannes_lab.compare import Comparison, compare
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.fit import Fit, fit
-from hannes_lab.greedy import _open_ended
+from hannes_lab.greedy import _left_open
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import effect_coordinates
 from hannes_lab.rig import Nuisance, linear_unit, load_rig, scaled_effect, unit_factor
@@ -297,7 +297,7 @@ def test_an_error_as_small_as_the_machine_repeats_leaves_nothing_to_look_for(
     assert any("leaves nothing to look for" in note for note in found.notes)
 
 
-def test_an_effect_at_the_end_of_its_range_must_take_half_of_the_error(
+def test_an_effect_that_the_data_leave_open_must_take_half_of_the_error(
     prepared: Prepared, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     only = effect_sources(only=["coulomb_friction", "cogging"])
@@ -305,32 +305,35 @@ def test_an_effect_at_the_end_of_its_range_must_take_half_of_the_error(
     assert [effect.name for effect in both.effects] == ["coulomb_friction", "cogging"]
     before, after = (fall.held_out_conditions for fall in both.falls[-2:])
     monkeypatch.setattr(
-        "hannes_lab.greedy._open_ended", lambda c, base: "cogging.period" if c.names[-1] == "cogging" else ""
+        "hannes_lab.greedy._left_open",
+        lambda search, c, base: "cogging.period" if c.names[-1] == "cogging" else "",
     )
-    monkeypatch.setattr("hannes_lab.greedy.OPEN_ENDED", 0.9 * (after / before) ** 2)
+    monkeypatch.setattr("hannes_lab.greedy.LEFT_OPEN", 0.9 * (after / before) ** 2)
     cut = diagnose(prepared, only)
     assert [effect.name for effect in cut.effects] == ["coulomb_friction"]
-    assert any(
-        "for the interval of cogging.period reaches the end of its range" in note for note in cut.notes
-    )
+    assert any("for the data leave cogging.period open" in note for note in cut.notes)
 
 
-def test_a_parameter_of_which_the_range_gives_one_end_is_open_ended() -> None:
-    """Not the strength that an effect has at least, and not a parameter that the data hold."""
+def test_what_the_data_leave_open() -> None:
+    """A shape to the end of its range, or all strengths to nought; not what the data hold, or was there before."""
     coordinates = tuple(effect_coordinates(load_effect("presliding_friction")))
     level, length = (c.name for c in coordinates)
+    assert (level, length) == ("presliding_friction.level", "presliding_friction.length")
     least = coordinates[1].bounds[0]
 
-    def named(off: float, precision: float, base: tuple[str, ...] = ()) -> str:
-        z = np.array([0.5, least + off])
-        found = Fit(Model.load(), coordinates, z, 1.0, np.ones(2), precision * np.eye(2))
-        alone = Candidate(base, found, 1.0)
-        return _open_ended(Candidate((*base, "presliding_friction"), found, 1.0), alone)
+    class Given:
+        effect = staticmethod(load_effect)
 
-    assert (level, length) == ("presliding_friction.level", "presliding_friction.length")
-    assert named(0.5, 10.0) == "" and named(0.5, 3.0) == length and named(0.0, 100.0) == length
-    assert named(2.5, 1.0) == "", "a strength may be nought"
-    assert named(0.0, 100.0, ("presliding_friction",)) == "", "it was there before"
+    def named(strength: float, off: float, precision: float, base: tuple[str, ...] = ()) -> str:
+        z = np.array([strength, least + off])
+        found = Fit(Model.load(), coordinates, z, 1.0, np.ones(2), precision * np.eye(2))
+        both = Candidate((*base, "presliding_friction"), found, 1.0)
+        return _left_open(Given(), both, Candidate(base, found, 1.0))  # type: ignore[arg-type]
+
+    assert named(0.5, 0.5, 10.0) == ""
+    assert named(1.0, 0.5, 3.0) == length and named(0.5, 0.0, 100.0) == length
+    assert named(0.5, 2.5, 3.0) == level and named(0.5, 0.5, 3.0) == f"{length}, {level}"
+    assert named(0.5, 0.0, 100.0, ("presliding_friction",)) == "", "it was there before"
 
 
 @pytest.mark.parametrize("kept", ["one condition", "one closure of each", "of this simulator"])

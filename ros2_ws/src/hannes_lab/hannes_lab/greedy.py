@@ -29,9 +29,9 @@ ALIKE = 0.02
 """Candidates whose held-out error is this close to the best, as a part of it, tie with it."""
 
 
-OPEN_ENDED = 0.5
-"""An effect with a parameter whose interval reaches the end of its range joins only if it leaves this part of the mean
-square error at most: what takes its least or its greatest value stands for something else."""
+LEFT_OPEN = 0.5
+"""An effect of which the data leave a parameter open to the end of its range, or all strengths to nought, joins only if
+it leaves this part of the mean square error at most: it stands for something else, or for nothing."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,7 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
             if two.falls(errors[-1]):
                 found = two
         if not found.falls(errors[-1]):
-            open_ended = found.open_ended
-            why = f", for the interval of {open_ended} reaches the end of its range" if open_ended else ""
+            why = f", for the data leave {found.left_open} open" if found.left_open else ""
             notes.append(
                 f"the next effect, {found.best.names[-1]}, would change the held-out error from {errors[-1]:.2f} to "
                 f"{found.error:.2f}; its mean square must fall by {100 * (1.0 - found.most):.0f} %{why}: the search "
@@ -113,14 +112,14 @@ class _Judged:
     """The best of some candidates, its held-out error, and those that are alike.
 
     most    part of the mean square error without it that may be left if it is to join
-    open_ended  names of its new parameters of which the range, and not the data, gives one end
+    left_open  what the data leave open of it
     """
 
     best: Candidate
     error: float
     rivals: tuple[Candidate, ...]
     most: float
-    open_ended: str = ""
+    left_open: str = ""
 
     def falls(self, before: float) -> bool:
         """Whether the error is as much smaller than the one before as it must be."""
@@ -132,12 +131,12 @@ def _judge(
 ) -> _Judged:
     """The best of the best fits by held-out error; of those that are alike, the one with the fewest parameters.
 
-    Each error counts in multiples of what it may be at most (OPEN_ENDED, or 1 - gain, of the mean square without it).
+    Each error counts in multiples of what it may be at most (LEFT_OPEN, or 1 - gain, of the mean square without it).
     """
     judged = search.each(_polish_in_worker, [(c,) for c in candidates[:JUDGED]], f"{text}: polish")
     held = search.each(held_out_error, [(c, True) for c in judged], f"{text}: held-out conditions")
-    ends = [_open_ended(candidate, base) for candidate in judged]
-    most = [min(OPEN_ENDED, 1.0 - gain) if end else 1.0 - gain for end in ends]
+    left_open = [_left_open(search, candidate, base) for candidate in judged]
+    most = [min(LEFT_OPEN, 1.0 - gain) if names else 1.0 - gain for names in left_open]
     scores = [error / math.sqrt(part) for error, part in zip(held, most, strict=True)]
     least = min(scores)
     alike = [k for k in range(len(judged)) if scores[k] <= (1.0 + ALIKE) * least]
@@ -149,18 +148,29 @@ def _judge(
     others = [k for k in alike if k != winner and most[k] == most[winner]]
     rivals = tuple(judged[k] for k in sorted(others, key=lambda k: held[k]))
     error = search.once(held_out_error, judged[winner], text=f"{text}: held-out conditions")
-    return _Judged(judged[winner], error, rivals, most[winner], ends[winner])
+    return _Judged(judged[winner], error, rivals, most[winner], left_open[winner])
 
 
-def _open_ended(candidate: Candidate, base: Candidate) -> str:
-    """Names of the parameters whose 95 % interval reaches the end of their range, of the effects beyond a base's."""
-    fit, new = candidate.fit, set(candidate.names) - set(base.names)
+def _left_open(search: Search, candidate: Candidate, base: Candidate) -> str:
+    """What the data leave open of the effects beyond a base's, by 95 % intervals: names of parameters.
+
+    Those whose interval reaches the end of their range, and the strengths of an effect that may all be nought.
+    """
+    fit = candidate.fit
     widths = 1.96 * fit.sd(max(1.0, fit.cost / fit.residual.size))
-    return ", ".join(
-        c.name
-        for c, z, width in zip(fit.coordinates, fit.z, widths, strict=True)
-        if c.name.split(".")[0] in new and c.at_end(float(z), width)
-    )
+    known = {c.name: (c, float(z), float(w)) for c, z, w in zip(fit.coordinates, fit.z, widths, strict=True)}
+    out = []
+    for name in candidate.names:
+        if name in base.names:
+            continue
+        parameters = search.effect(name).parameters
+        own = {f"{name}.{p.name}": p.vanishing is not None for p in parameters}
+        out += [n for n in own if known[n][0].at_end(*known[n][1:])]
+        # z is 0 where a strength vanishes.
+        strengths = [n for n, strength in own.items() if strength]
+        if all(abs(known[n][1]) <= known[n][2] for n in strengths):
+            out += [n for n in strengths if n not in out]
+    return ", ".join(out)
 
 
 def _close_call(best: Candidate, rivals: Sequence[Candidate]) -> str:
