@@ -108,17 +108,19 @@ def diagnose(
         progress=progress,
     )
     null, choice = _chosen(search, greedy, max_effects)
-    if not greedy:
-        null, choice = _named_instead(null, choice, search, max_effects)
-    search, best, limits = choice.search, choice.best, choice.limits
-    prepared = replace(prepared, problem=search.problem)
-    falls = error_falls(prepared, search, best, in_order=greedy)
     answered = choice.adequate or choice.enough
+    prepared = replace(prepared, problem=choice.search.problem)
+    falls = error_falls(prepared, choice.search, choice.best, in_order=greedy)
+    if answered and not greedy:
+        choice, falls = without_idle(choice, falls)
+        null, instead = _named_instead(null, choice, search)
+        if instead is not choice:
+            choice = instead
+            prepared = replace(prepared, problem=choice.search.problem)
+            falls = error_falls(prepared, choice.search, choice.best)
+    search, best, limits = choice.search, choice.best, choice.limits
     if not answered:
         best, falls = worth_showing(search, best, falls)
-    elif not greedy:
-        choice, falls = without_idle(choice, falls)
-        best = choice.best
     verdict = "unknown" if not answered else "effects" if best.names else "nothing"
     tied = tied_sets(choice) if verdict == "effects" else ()
     best = search.with_spread(best)
@@ -161,41 +163,50 @@ def _chosen(search: Search, greedy: bool, max_effects: int) -> tuple[Candidate, 
     return null, (choose_greedily if greedy else choose)(search, null, limits, max_effects)
 
 
-def _named_instead(
-    null: Candidate, choice: Choice, search: Search, max_effects: int
-) -> tuple[Candidate, Choice]:
+def _named_instead(null: Candidate, choice: Choice, search: Search) -> tuple[Candidate, Choice]:
     """Name the effect that is the same thing as a parameter of the recordings which is far off in all that have it.
 
     Where little is known of a recording, a parameter of its own takes the effect over (the damping of an object that
-    nobody described), and its prior charges less than an effect must gain.  So the search is made without that
-    parameter too, and is the answer where it explains all for less.  An effect adds to the nominal value: only what is
-    far above it counts.
+    nobody described), and its prior charges less than an effect must gain.  So the parameter is put back to its nominal
+    value, the effect in its place, and that is the answer where it explains all for less.  An effect adds to the
+    nominal value: only what is far above it counts.
     """
-    off = choice.best.fit.point
-    least: dict[str, float] = {}
-    for n in search.nuisances:
-        if n.effect and n.name in off:
-            least[n.effect] = min(off[n.name], least.get(n.effect, math.inf))
-    same = {effect for effect, farness in least.items() if farness > FAR} & set(search.sources)
-    same -= set(choice.best.names)
+    best = choice.best
+    found: dict[str, list[tuple[float, float]]] = {}
+    for c, z in zip(best.fit.coordinates, best.fit.z, strict=True):
+        effect = next((n.effect for n in search.nuisances if n.name == c.name), "")
+        if effect in search.sources and effect not in best.names:
+            found.setdefault(effect, []).append((float(z), c.value(float(z)) - c.value(0.0)))
+    same = {effect: values for effect, values in found.items() if min(z for z, _ in values) > FAR}
     if not (same and choice.adequate):
         return null, choice
     rest = [n for n in search.nuisances if n.effect not in same]
     other = replace(search, nuisances=rest, found={}, _nominal={}, _minima={}, _scans={}, _key="")
-    bare, instead = _chosen(other, False, max_effects)
-    if not (instead.adequate and same <= set(instead.best.names)):
+    bare, names = other.null(), (*best.names, *same)
+    _, coordinates = other.with_effects(names)
+    start = dict(best.fit.point)
+    for effect, values in same.items():
+        first = next(p.name for p in search.effect(effect).parameters if p.vanishing is not None)
+        own = next(c for c in coordinates if c.name == f"{effect}.{first}")
+        start[own.name] = own.z(own.offset + float(np.mean([value for _, value in values])))
+    instead = other.from_point(names, {c.name: start.get(c.name, 0.0) for c in coordinates})
+    if instead.penalised > best.penalised:
         return null, choice
-    # Noise is estimated at each of the two: they are compared with that of the same one.
-    again = replace(choice.best, fit=instead.search.refit(choice.best.fit))
-    before = choice.best.penalised - choice.best.fit.cost + again.fit.cost
-    if instead.best.penalised > before:
+    new = other.renewed(instead)
+    (refitted,) = new.refitted([instead])
+    again = new.polish(refitted)
+    limits = chance(new.problem, again.fit, new.signatures(again))
+    if not is_adequate(new, again, limits):
         return null, choice
     held = ", ".join(n.name for n in search.nuisances if n.effect in same)
     note = (
         f"{held} would do the same, far outside what is usual (misfit, with what priors and parameters charge, "
-        f"{before:.0f} instead of {instead.best.penalised:.0f}): held at the nominal value here"
+        f"{best.penalised:.0f} instead of {instead.penalised:.0f}): held at the nominal value here"
     )
-    return bare, replace(instead, notes=(*instead.notes, note))
+    made = replace(
+        choice, search=new, best=again, limits=limits, rivals=(), notes=(*choice.notes, note), idle=""
+    )
+    return bare, made
 
 
 def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple[Fall, ...]]:

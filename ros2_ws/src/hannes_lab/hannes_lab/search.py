@@ -451,9 +451,11 @@ class Search:
             _key="",
         )
 
-    def refit(self, found: Fit) -> Fit:
-        """A fit of another problem, perhaps with other nuisance parameters, carried on in this one."""
-        return self._again(found, 8)
+    def from_point(self, names: Names, start: Mapping[str, float]) -> Candidate:
+        """Fit a set of effects from one point (z by name)."""
+        model, coordinates = self.with_effects(names)
+        found = fit(self.problem, model, coordinates, start, rows=self.rows, evaluations=WHOLE)
+        return self._known(_candidate(names, found))
 
     def _refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
         """A candidate of another problem (other noise), fitted in this one from its point."""
