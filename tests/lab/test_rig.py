@@ -314,6 +314,20 @@ def test_an_effect_that_the_data_leave_open_must_take_half_of_the_error(
     assert any("for the data leave cogging.period open" in note for note in cut.notes)
 
 
+def test_an_effect_that_may_be_nought_at_the_end_is_left_out(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only = effect_sources(only=["coulomb_friction", "cogging"])
+    monkeypatch.setattr(
+        "hannes_lab.diagnose._may_be_nought", lambda search, found, limits: found.names[-1] == "cogging"
+    )
+    found = diagnose(prepared, only)
+    assert [effect.name for effect in found.effects] == ["coulomb_friction"] and found.verdict == "effects"
+    assert found.tied == (("coulomb_friction",),) and found.falls[-1].added == "coulomb_friction"
+    assert any("cogging joined too" in note for note in found.notes)
+    assert [effect.name for effect in found.model.effects] == ["coulomb_friction"]
+
+
 def test_what_the_data_leave_open() -> None:
     """A shape to the end of its range, or all strengths to nought; not what the data hold, or was there before."""
     coordinates = tuple(effect_coordinates(load_effect("presliding_friction")))

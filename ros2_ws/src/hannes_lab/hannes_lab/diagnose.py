@@ -123,7 +123,14 @@ def diagnose(
         best, falls = worth_showing(search, best, falls)
     verdict = "unknown" if not answered else "effects" if best.names else "nothing"
     tied = tied_sets(choice) if verdict == "effects" else ()
-    best = search.with_spread(best)
+    best, left_out = search.with_spread(best), []
+    while greedy and len(best.names) > 1 and _may_be_nought(search, best, limits):
+        left_out.append(
+            f"{best.names[-1]} joined too, but by its 95 % intervals its strength may be nought: it is left out"
+        )
+        falls = falls[:-1]
+        best = search.with_spread(search.found[key_of(best.names[:-1])])
+        tied = (best.names,) if tied else ()
     effects = found_effects(search, best, limits, falls)
     experiments = (
         separating_experiments(prepared, search, [search.found[key_of(n)] for n in tied])
@@ -147,6 +154,7 @@ def diagnose(
         notes=(
             *prepared.notes,
             *choice.notes,
+            *left_out,
             *notes(search, best, verdict, experiments, greedy),
         ),
         simulations=prepared.problem.simulations,
@@ -161,6 +169,16 @@ def _chosen(search: Search, greedy: bool, max_effects: int) -> tuple[Candidate, 
     null = search.null()
     limits = chance(search.problem, null.fit, search.signatures(null))
     return null, (choose_greedily if greedy else choose)(search, null, limits, max_effects)
+
+
+def _may_be_nought(search: Search, found: Candidate, limits: Chance) -> bool:
+    """Whether the 95 % intervals of all strengths of the last effect hold the value at which it vanishes."""
+    name, intervals = found.names[-1], intervals_of(found.fit, limits)
+    return all(
+        intervals[f"{name}.{p.name}"][0] <= p.vanishing <= intervals[f"{name}.{p.name}"][1]
+        for p in search.effect(name).parameters
+        if p.vanishing is not None
+    )
 
 
 def _named_instead(null: Candidate, choice: Choice, search: Search) -> tuple[Candidate, Choice]:
