@@ -107,7 +107,9 @@ def diagnose(
         executor=executor or Executor(jobs),
         progress=progress,
     )
-    null, choice = _chosen(search, greedy, max_effects)
+    null = search.null()
+    limits = chance(search.problem, null.fit, search.signatures(null))
+    choice = (choose_greedily if greedy else choose)(search, null, limits, max_effects)
     answered = choice.adequate or choice.enough
     prepared = replace(prepared, problem=choice.search.problem)
     falls = error_falls(prepared, choice.search, choice.best, in_order=greedy)
@@ -164,13 +166,6 @@ def diagnose(
     )
 
 
-def _chosen(search: Search, greedy: bool, max_effects: int) -> tuple[Candidate, Choice]:
-    """The model as it is, fitted, and the set of effects that is the answer."""
-    null = search.null()
-    limits = chance(search.problem, null.fit, search.signatures(null))
-    return null, (choose_greedily if greedy else choose)(search, null, limits, max_effects)
-
-
 def _may_be_nought(search: Search, found: Candidate, limits: Chance) -> bool:
     """Whether the 95 % intervals of all strengths of the last effect hold the value at which it vanishes."""
     name, intervals = found.names[-1], intervals_of(found.fit, limits)
@@ -198,8 +193,7 @@ def _named_instead(null: Candidate, choice: Choice, search: Search) -> tuple[Can
     same = {effect: values for effect, values in found.items() if min(z for z, _ in values) > FAR}
     if not (same and choice.adequate):
         return null, choice
-    rest = [n for n in search.nuisances if n.effect not in same]
-    other = replace(search, nuisances=rest, found={}, _nominal={}, _minima={}, _scans={}, _key="")
+    other = search.with_nuisances([n for n in search.nuisances if n.effect not in same])
     bare, names = other.null(), (*best.names, *same)
     _, coordinates = other.with_effects(names)
     start = dict(best.fit.point)

@@ -440,16 +440,14 @@ class Search:
         problem = build_problem(
             rig, self.problem.features, best.fit.model, self.nuisances, best.fit.values, self.problem.counts
         )
-        return replace(
-            self,
-            problem=problem,
-            before=self.found.get((), self.before),
-            found={},
-            _nominal={},
-            _minima={},
-            _scans={},
-            _key="",
-        )
+        return self._emptied(problem=problem, before=self.found.get((), self.before))
+
+    def with_nuisances(self, nuisances: Sequence[Nuisance]) -> Search:
+        """The same search with other nuisance parameters; nothing that was found holds for it."""
+        return self._emptied(nuisances=nuisances)
+
+    def _emptied(self, **changes: Any) -> Search:
+        return replace(self, found={}, _nominal={}, _minima={}, _scans={}, _key="", **changes)
 
     def from_point(self, names: Names, start: Mapping[str, float]) -> Candidate:
         """Fit a set of effects from one point (z by name)."""
