@@ -49,17 +49,17 @@ def test_nodes_stay_on_this_machine_unless_the_user_says_otherwise(
     assert ros_environment(environment) == environment
 
 
-def test_both_profiles_find_and_forget_nodes_alike() -> None:
+def test_both_profiles_find_and_forget_nodes_and_repair_losses_alike() -> None:
     local = Path(ros_environment({})[PROFILES])
     found = [
         [
             "".join(ElementTree.tostring(part, encoding="unicode").split())
-            for name in ("leaseDuration", "leaseAnnouncement", "initialAnnouncements")
+            for name in ("leaseDuration", "leaseAnnouncement", "initialAnnouncements", "heartbeatPeriod")
             for part in ElementTree.parse(profile).getroot().iterfind(f".//{{*}}{name}")
         ]
         for profile in (local, local.with_name("fastdds.xml"))
     ]
-    assert len(found[0]) == 3 and found[0] == found[1]
+    assert len(found[0]) == 4 and found[0] == found[1]
 
 
 @pytest.mark.parametrize("range_", ["SUBNET", "LOCALHOST"])
