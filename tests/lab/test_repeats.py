@@ -6,7 +6,7 @@ from hannes_description.model import Model
 from hannes_lab.features import build_features, compact_end
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
-from hannes_lab.repeats import FEW, end_of
+from hannes_lab.repeats import FEW, end_of, few
 from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import load_effect
 
@@ -36,6 +36,10 @@ def simulated(trial: Trial, **hysteresis: float) -> tuple[list[int], float, floa
     span = float(np.ptp(exact))
     copied = block.predicted(whole[: compact_end(trial)], True)
     return ticks, float(np.abs(found - exact).max()) / span, float(np.abs(copied - exact).max()) / span
+
+
+def test_closures_of_one_condition_are_counted(trial: Trial) -> None:
+    assert few(trial) == FEW and few(trial.only(trial.closures[:3])) == 3
 
 
 def test_a_glove_that_creeps_back_within_a_few_closures(trial: Trial) -> None:

@@ -13,6 +13,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.compare import Comparison, compare
 from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.features import compact_end
 from hannes_lab.fit import Fit, fit
 from hannes_lab.greedy import _left_open
 from hannes_lab.prepare import Prepared, prepare
@@ -164,6 +165,22 @@ def test_commands_take_the_adapter(
     monkeypatch.setattr("sys.argv", ["hannes", *words, "--topic", "motor_current=/rig/iq"])
     assert main() == 2
     assert "--topic is for bags" in " ".join(capsys.readouterr().err.split())
+
+
+def test_laps_that_repeat_each_other_are_simulated_for_two(prepared: Prepared) -> None:
+    """Moves from place to place, each a condition: the second lap stands for the others, if nothing is out of turn."""
+    (trial,) = prepared.rig.trials
+    assert trial.in_turn and trial.repeats[:3] == (0, 1, 2) and set(trial.repeats[5:]) == set(range(5, 10))
+    (end,) = prepared.features.ends
+    assert end is not None and end < 0.45 * trial.reference.size
+    values = {"motor.armature": 2.2}
+    short = prepared.features.closures(prepared.rig, prepared.model, values)
+    whole = replace(prepared.features, ends=(None,), slices=()).closures(prepared.rig, prepared.model, values)
+    for block, a, b in zip(prepared.features.blocks, short, whole, strict=True):
+        scatter = float((block.measured - block.measured.mean(axis=0)).std())
+        assert np.abs(a - b).max() < 1e-3 * scatter, block.condition
+    one_missing = trial.only([c for k, c in enumerate(trial.closures) if k != 11])
+    assert not one_missing.in_turn and compact_end(one_missing) is None
 
 
 def test_broken_adapters_are_clear_errors(tmp_path: Path) -> None:

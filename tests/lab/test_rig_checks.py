@@ -186,7 +186,7 @@ def test_a_recording_that_is_not_there_is_refused(lab: Lab) -> None:
     [
         ("None", "it returned nothing"),
         ("{'position': run.encoder_position}", "gives no encoder_position, drive_force"),
-        ("{k: v[:-5] for k, v in s.items()}", "of shape (7795,)"),
+        ("{k: v[:-5] for k, v in s.items()}", "of shape (5255,)"),
         ("{k: list(v) for k, v in s.items()}", "as list"),
         ("{**s, 'drive_force': s['drive_force'] * np.nan}", "makes 'drive_force' of trial 'mass' NaN"),
         ("{**s, 'drive_force': trial.options['gain']}", "failed: KeyError: 'gain'"),

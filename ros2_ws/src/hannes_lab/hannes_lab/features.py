@@ -310,14 +310,13 @@ def build_features(
 
 
 def compact_end(trial: Trial, most: float = NEARLY) -> int | None:
-    """Ticks up to the end of the last closure that others repeat, if all closures have (nearly) the same reference.
+    """Ticks up to the end of the last closure that others repeat, if those have (nearly) its reference.
 
     most  mean difference of the references, in their span
     """
     repeats = trial.repeats
-    if len(trial.conditions) != 1 or len(trial.closures) <= len(set(repeats)):
-        return None
-    if trial.apart > most:
+    alone = len(trial.closures) <= len(set(repeats)) or (trial.anew and len(trial.conditions) != 1)
+    if alone or not trial.in_turn or trial.apart > most:
         return None
     return end_of(trial, max(repeats) + 1)
 
@@ -344,8 +343,11 @@ def _block(
     full: list[tuple[Index, Index, Array]] = []
     compact: list[tuple[Index, Index, Array]] = []
     measured = []
-    # Where a simulation may be compact, all closures are of one condition.
-    bases = [trial.closures[k] for k in trial.repeats] if limit is not None else closures
+    bases = [
+        trial.closures[k]
+        for k, c in zip(trial.repeats, trial.closures, strict=True)
+        if c.condition == condition
+    ]
     for closure, base in zip(closures, bases, strict=True):
         at = closure.start + phase
         right = np.searchsorted(time, at)

@@ -14,7 +14,8 @@ from .trials import SAME, Trial
 Array = NDArray[np.float64]
 
 FEW = 4
-"""Closures that are simulated where the second does not end as the first did; all, if the last two of these do not."""
+"""Closures of each condition that are simulated where the second does not end as the first did; all, if the last two of
+these do not."""
 
 WORTH = 0.7
 """Part of a recording below which its first FEW closures are worth being simulated alone."""
@@ -29,42 +30,58 @@ def end_of(trial: Trial, count: int) -> int:
 
 
 def came_back(run: Rollout, trial: Trial, most: float) -> bool:
-    """Whether the last closure of a run ends where the one before did, on both sides of the wire: then all repeat it.
+    """Whether in each condition the last closure of a run ends where the one before did, on both sides of the wire.
 
-    A hand whose joints stick stays where they stop, a little further with each closure, which the encoder hardly shows.
+    Then all repeat it.  A hand whose joints stick stays where they stop, a little further with each closure, which the
+    encoder hardly shows.
 
     most  part of the reference's span by which its ends may differ
     """
-    ends = [round(closure.stop / trial.period) for closure in trial.closures]
-    ends = [end for end in ends if end < run.raw.shape[0]]
-    if len(ends) < 2:
-        return True
-    here, there = run.raw[ends[-1], [R_Q, R_QL]], run.raw[ends[-2], [R_Q, R_QL]]
-    return bool(np.abs(here - there).max() <= most * trial.span)
+    ends: dict[str, list[int]] = {}
+    for closure in trial.closures:
+        end = round(closure.stop / trial.period)
+        if end < run.raw.shape[0]:
+            ends.setdefault(closure.condition, []).append(end)
+    pairs = [own[-2:] for own in ends.values() if len(own) > 1]
+    moved = [np.abs(run.raw[there, [R_Q, R_QL]] - run.raw[here, [R_Q, R_QL]]).max() for there, here in pairs]
+    return bool(max(moved, default=0.0) <= most * trial.span)
+
+
+def few(trial: Trial) -> int:
+    """How many closures of a trial it takes to have FEW of each condition, or all where there are fewer."""
+    return 1 + max(k for own in _numbers(trial) for k in own[:FEW])
 
 
 def few_will_do(trial: Trial) -> bool:
-    """Whether FEW closures are many fewer than there are, and the others have the same reference."""
+    """Whether that is much less than the whole, and the others have the same reference, in the same order."""
     return (
-        len(trial.closures) > FEW
-        and end_of(trial, FEW) < WORTH * trial.reference.size
+        few(trial) < len(trial.closures)
+        and end_of(trial, few(trial)) < WORTH * trial.reference.size
         and trial.apart <= SAME
+        and trial.in_turn
     )
 
 
 def repeated(signals: Mapping[str, Array], trial: Trial) -> dict[str, Array]:
-    """Signals of the whole trial from those of its first FEW closures, the last of which the later ones repeat."""
-    like = trial.closures[FEW - 1]
-    begin = round(like.start / trial.period)
-    places = [
-        (round(c.start / trial.period), trial.same_place(c, like) - begin) for c in trial.closures[FEW:]
-    ]
+    """Signals of the whole trial from those of its few first closures: later ones repeat the last of theirs."""
+    first = few(trial)
+    places = []
+    for own in _numbers(trial):
+        like = trial.closures[[k for k in own if k < first][-1]]
+        begin = round(like.start / trial.period)
+        later = [trial.closures[k] for k in own if k >= first]
+        places += [(round(c.start / trial.period), trial.same_place(c, like) - begin) for c in later]
     out = {}
     for name, values in signals.items():
         whole = np.full(trial.reference.size, values[-1])
         whole[: values.size] = values
-        for start, shift in places:
+        for start, shift in sorted(places):
             one = values[start - shift :][: whole.size - start]
             whole[start : start + one.size] = one
         out[name] = whole
     return out
+
+
+def _numbers(trial: Trial) -> list[list[int]]:
+    """Numbers of the closures of each condition."""
+    return [[k for k, c in enumerate(trial.closures) if c.condition == name] for name in trial.conditions]

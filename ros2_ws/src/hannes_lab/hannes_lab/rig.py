@@ -28,7 +28,7 @@ from hannes_sim.rollout import Controller, Rollout, rollout, step_of
 from numpy.typing import NDArray
 
 from .clock import REFERENCE_DELAY, moved
-from .repeats import FEW, came_back, end_of, few_will_do, repeated
+from .repeats import came_back, end_of, few, few_will_do, repeated
 from .trials import SAME, Trial
 
 if TYPE_CHECKING:
@@ -302,7 +302,7 @@ class PlantRig:
         """Signals of the whole trial, where the second closure does not end as the first did."""
         if few_will_do(trial):
             self._came_back = True
-            signals = self.observed(model, values, trial, trial.reference[: end_of(trial, FEW)])
+            signals = self.observed(model, values, trial, trial.reference[: end_of(trial, few(trial))])
             if self._came_back:
                 return repeated(signals, trial)
         return self.observed(model, values, trial, trial.reference)

@@ -155,9 +155,17 @@ class Trial:
 
     @property
     def repeats(self) -> tuple[int, ...]:
-        """For each closure the number of the one that it repeats, for a machine without memory."""
+        """For each closure the number of the one that it repeats, for a machine without memory.
+
+        In one recording that is the second of its condition: the first one may be the first after the start.
+        """
         if not self.anew:
-            return tuple(min(k, 1) for k in range(len(self.closures)))
+            own: dict[str, list[int]] = {}
+            for k, closure in enumerate(self.closures):
+                own.setdefault(closure.condition, []).append(k)
+            return tuple(
+                k if (of := own[c.condition]).index(k) == 0 else of[1] for k, c in enumerate(self.closures)
+            )
         # The first recording has the most closures; outliers may be missing.
         until = self.parts[1].begin
         base = {c.number: k for k, c in enumerate(self.closures) if 0.5 * (c.start + c.stop) < until}
@@ -185,6 +193,12 @@ class Trial:
             # A fresh reference sample may fall one tick earlier or later from closure to closure.
             most = max(most, float(np.mean(np.abs(other - shape[: other.size]))) / span)
         return most
+
+    @cached_property
+    def in_turn(self) -> bool:
+        """Whether before each closure the same condition stands as before the one that it repeats."""
+        before = [None, *(c.condition for c in self.closures)]
+        return self.anew or all(before[k] == before[like] for k, like in enumerate(self.repeats) if k != like)
 
     def same_place(self, closure: Closure, like: Closure) -> int:
         """Tick at which the reference of a closure begins to be that of another one.
