@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from hannes_description.model import Model
+from hannes_sim.measurement import sample_noise
 from numpy.typing import NDArray
 
 from .depends import Dependence, residual_dependences
@@ -23,6 +24,9 @@ from .problem import nuisance_coordinate
 from .wording import clock_note
 
 Array = NDArray[np.float64]
+
+CONTACT, CONTACT_OVER_NOISE = 0.02, 5.0
+"""There is contact where the grip force exceeds this part of its greatest value, and this multiple of its noise."""
 
 FALSE_DISCOVERY_RATE = 0.05
 DRAWS = 2000
@@ -178,7 +182,10 @@ def _titles(features: Features) -> list[str]:
 
 
 def _contact(prepared: Prepared, values: Mapping[str, float]) -> dict[int, tuple[Array, Array] | None]:
-    """Per trial, when there is contact, on the control grid: from the measured force, else from the model's."""
+    """Per trial, when there is contact, at its samples: from the measured force, else from the model's.
+
+    None where there is no force, or none that stands out from its own noise.
+    """
     out: dict[int, tuple[Array, Array] | None] = {}
     for k, trial in enumerate(prepared.features.trials):
         if "grip_force" in trial.signals:
@@ -191,8 +198,9 @@ def _contact(prepared: Prepared, values: Mapping[str, float]) -> dict[int, tuple
                 continue
             force = run["grip_force"]
             time = np.arange(force.size, dtype=np.float64) * trial.period
-        top = float(force.max())
-        out[k] = (time, (force > 0.02 * top).astype(float)) if top > 0.0 else None
+        least = max(CONTACT * float(force.max()), CONTACT_OVER_NOISE * sample_noise(force))
+        touching = force > least
+        out[k] = (time, touching.astype(float)) if touching.any() else None
     return out
 
 

@@ -78,7 +78,7 @@ def metrics(
     maximum_current          largest |i| after the transient (R10)
     average_opening_current  mean |i| of the opening after the current has fallen (R11)
     slope_opening_current    slope of |i| between 90 and 10 % of its fall (R12)
-    maximum_grip_force       R13
+    maximum_grip_force       R13; in void closures NaN
     """
     out = dict.fromkeys(METRICS, float("nan"))
     if position is not None:
@@ -111,7 +111,7 @@ def metrics(
                     np.argmax(np.where(grasp | opening | (labels == PHASES.index("hold")), i, -np.inf))
                 )
                 out["slope_opening_current"] = _slope(phase, i, np.arange(peak, low + 1), rising=False)
-    if force is not None:
+    if force is not None and (labels == PHASES.index("grasp")).any():
         out["maximum_grip_force"] = float(force.max())
     return out
 
