@@ -5,8 +5,15 @@ from dataclasses import replace
 from hannes_description.model import Model
 from hannes_lab.features import build_features
 from hannes_lab.hide import make_set
-from hannes_lab.prepare import drifts
+from hannes_lab.prepare import drifts, notes_of
 from hannes_lab.trials import make_trial
+
+
+def test_what_is_said_of_several_recordings_stands_once() -> None:
+    recordings, _ = make_set(Model.load(), [], seed=5, closures=2, conditions=("fast", "slow", "grasp"))
+    a, b, c = (make_trial(r) for r in recordings)
+    noted = [replace(a, notes=("one", "two")), replace(b, notes=("two",)), c]
+    assert notes_of(noted) == [f"{a.name}: one", f"{a.name}, {b.name}: two"]
 
 
 def test_closures_that_drift_are_said_to() -> None:

@@ -36,6 +36,7 @@ from .experiments import VISIBLE, Experiment
 from .own_effect import check_own_effects
 from .prepare import Prepared, load_trials, prepare, read_trials
 from .rig import load_rig
+from .trials import SIGNALS as COMPARED
 from .trials import UNITS
 
 Bags = Annotated[list[Path], typer.Argument(help="Bags, or folders of bags; one bag may hold many closures.")]
@@ -61,7 +62,8 @@ Topics = Annotated[
     list[str] | None,
     typer.Option(
         "--topic",
-        help="Topic that carries a signal, as SIGNAL=TOPIC, where the name does not say it; SIGNAL= leaves it out.",
+        help="Topic that carries a signal, as SIGNAL=TOPIC, where the name does not say it; SIGNAL= leaves it out. "
+        f"Signals: {', '.join(('reference_position', *COMPARED))}.",
     ),
 ]
 RigFile = Annotated[
@@ -268,7 +270,12 @@ def compare(
     bags: Bags,
     model: ModelFile = "nominal",
     fitted: Annotated[
-        bool, typer.Option("--fitted", help="Fit the uncertain nominal parameters first.")
+        bool,
+        typer.Option(
+            "--fitted",
+            help="Fit the uncertain nominal parameters first, each within its tolerance, to what repeats best: that "
+            "may raise the error of a signal or phase that scatters more.",
+        ),
     ] = False,
     objects: Objects = None,
     scale: Scale = None,

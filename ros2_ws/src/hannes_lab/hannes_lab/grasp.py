@@ -1,7 +1,8 @@
 """Was something grasped, and about how stiff and where?  Read from the closures where nobody said so.
 
-While closing, an object adds a force that grows from one position on; no closure on nothing shows it there.  So the
-drive current against position, without that part of it which accelerates the nominal hand, is compared with that of the
+While closing, an object adds a force that grows from one position on; no closure on nothing shows it there.  Where a
+dynamometer shows it, that is all there is to be seen; where it shows nothing it may be elsewhere.  Otherwise the drive
+current against position, without that part of it which accelerates the nominal hand, is compared with that of the
 other recordings of the set, or, where none of them comes so far, with the nominal hand's.  A glove or a tight spring is
 there in all recordings, and is no object.
 """
@@ -29,10 +30,14 @@ Array = NDArray[np.float64]
 FREE_TRAVEL = 0.2
 """Part of the way in which the motor starts up: its current says nothing of an object."""
 
-EXCESS = (1.5, 0.05)
+EXCESS = (1.3, 0.05)
 EXCESS_OVER_NOMINAL = 2.0
 """An object is seen where the current exceeds this multiple of what moves the free hand at the same place, by this much
 (A).  The nominal hand's current is less to be trusted than that of another recording of the same hand."""
+
+LEAST_FORCE, OVER_NOISE = 0.5, 8.0
+"""N, and multiples of how much it varies in the free travel, by which a recorded grip force rises where there is an
+object."""
 
 LEAST_FREE = 0.8
 """Part of the nominal hand's current that a free hand takes at least, whatever another recording shows that brakes."""
@@ -73,9 +78,14 @@ def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
         if not free or ("object" in trial.options and "sensors" in trial.options):
             out.append(trial)
             continue
-        seen = _seen(curves[k], [c for j, c in enumerate(curves) if j != k], _nominal(model))
+        seen = _felt(trial, model) or _seen(
+            curves[k], [c for j, c in enumerate(curves) if j != k], _nominal(model)
+        )
         if seen is None:
-            note = f"no grasp is seen in the closures; say --object {trial.name}=soft (or rigid) if there was one"
+            note = (
+                "no grasp is seen in the closures, so there was none; say --object CONDITION=soft (or rigid) if there "
+                "was one after all"
+            )
             out.append(trial if given else replace(trial, notes=(*trial.notes, note)))
             continue
         stiffness, place = seen
@@ -140,12 +150,10 @@ def closing_curve(trial: Trial, model: Model) -> Curve | None:
     if "encoder_position" not in trial.signals:
         return None
     closures = trial.of(trial.conditions[0])
-    length = min(c.stop - c.start for c in closures)
-    phase = np.linspace(0.0, length, max(round(length / STEP), 400))
+    phase = _phase(trial)
     position = trial.mean_closure("encoder_position", phase)
     if "motor_current" in trial.signals:
-        sampled = float(np.median(np.diff(trial.signals["encoder_position"][0])))
-        span = max(SMOOTH, SAMPLES * sampled)
+        span = _span(trial)
         logged = trial.mean_closure("motor_current", phase)
         current, most = (
             _still(phase, position, logged, span, model, braked=braked)
@@ -166,6 +174,44 @@ def closing_curve(trial: Trial, model: Model) -> Curve | None:
     return _advancing(np.maximum.accumulate(position[way]), current[way], most[way])
 
 
+def _phase(trial: Trial) -> Array:
+    """Points (p,) in time of the mean closing, s."""
+    length = min(c.stop - c.start for c in trial.of(trial.conditions[0]))
+    return np.linspace(0.0, length, max(round(length / STEP), 400))
+
+
+def _span(trial: Trial) -> float:
+    """s over which its curves are smoothed."""
+    return max(SMOOTH, SAMPLES * float(np.median(np.diff(trial.signals["encoder_position"][0]))))
+
+
+def _window(phase: Array, span: float) -> int:
+    """That span as an odd number of points."""
+    return 2 * max(round(0.5 * span / float(phase[1] - phase[0])), 2) + 1
+
+
+def _felt(trial: Trial, model: Model) -> tuple[float, float] | None:
+    """Stiffness at the pulley (N.m/rad) and place (rad) of an object whose force was recorded; None if none is felt."""
+    if not {"grip_force", "encoder_position"} <= set(trial.signals):
+        return None
+    phase = _phase(trial)
+    position = trial.mean_closure("encoder_position", phase)
+    force = savgol_filter(trial.mean_closure("grip_force", phase), _window(phase, _span(trial)), 1)
+    top = int(np.argmax(position))
+    free = position[: top + 1] < FREE_TRAVEL * position[top]
+    if free.sum() < 4:
+        return None
+    zero, noise = float(np.median(force[: top + 1][free])), float(np.std(force[: top + 1][free]))
+    peak = int(np.argmax(force[: top + 1]))
+    if force[peak] - zero < max(LEAST_FORCE, OVER_NOISE * noise) or not free[0]:
+        return None
+    q, rise = np.maximum.accumulate(position[: peak + 1]), force[: peak + 1] - zero
+    (start, low), (stop, high) = (_last_rise(q, rise, part * float(rise[-1])) for part in RISE)
+    slope = max(high - low, 1e-6) / max(stop - start, 1e-3)
+    stiffness = slope * model.parameters.value("hand.fingertip_travel")
+    return float(np.clip(stiffness, 1e-3, 5.0)), max(start - low / slope, 0.0)
+
+
 def _still(time: Array, position: Array, current: Array, span: float, model: Model, *, braked: bool) -> Array:
     """The current (p,) A without what accelerates the nominal hand and what its viscous friction takes.
 
@@ -173,8 +219,7 @@ def _still(time: Array, position: Array, current: Array, span: float, model: Mod
     braked  the current is also without what brakes the hand
     """
     value = model.parameters.value
-    step = float(time[1] - time[0])
-    window = 2 * max(round(0.5 * span / step), 2) + 1
+    step, window = float(time[1] - time[0]), _window(time, span)
     velocity, acceleration = (savgol_filter(position, window, 3, deriv=k, delta=step) for k in (1, 2))
     inertia = value("motor.armature") * value("gear.ratio") ** 2 + value("hand.inertia")
     torque = inertia * acceleration + value("friction.viscous") * velocity
@@ -224,14 +269,16 @@ def _seen(
     least = max(base[peak], LEAST_FREE * free[peak])
     if base is free and sure[peak] < factor * least + EXCESS[1]:
         return None
-    if current[peak] - _ripple(q[: peak + 1], current[: peak + 1]) < factor * least + EXCESS[1]:
+    ripple = _ripple(q[: peak + 1], current[: peak + 1])
+    if current[peak] - ripple < factor * least + EXCESS[1]:
         return None
     excess = (current - base)[: peak + 1]
     # From the peak backwards: what a quick start takes more than a slow one is no object.
     (start, low), (stop, high) = (_last_rise(q, excess, part * float(excess[-1])) for part in RISE)
     slope = max(high - low, 1e-6) / max(stop - start, 1e-3)
     place = start - low / slope
-    if slope * per_ampere < STIFFER * rate or place < FREE_TRAVEL * q[-1]:
+    sure_of = slope * max(1.0 - ripple / max(high - low, 1e-6), 0.0)
+    if sure_of * per_ampere < STIFFER * rate or place < FREE_TRAVEL * q[-1]:
         return None
     return float(np.clip(slope * per_ampere, 1e-3, 5.0)), max(place, 0.0)
 

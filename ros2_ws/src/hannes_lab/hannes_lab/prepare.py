@@ -156,7 +156,7 @@ def without_outliers(trial: Trial) -> Trial:
     if not dropped:
         return trial
     note = f"{len(dropped)} closure(s) far from the others are left out, starting at " + ", ".join(
-        f"{c.start:.1f} s" for c in dropped
+        f"{max(c.start, 0.0):.1f} s" for c in dropped
     )
     return replace(trial, closures=tuple(sorted(kept, key=lambda c: c.start)), notes=(*trial.notes, note))
 
@@ -201,7 +201,7 @@ def prepare(
     # Near is enough for the noise; the search fits the model as it is again, to the end.
     settled, found = settle(problem, found, moves=3)
     problem = build_problem(settled.rig, features, model, nuisances, found.values, problem.counts)
-    notes = [f"{trial.name}: {note}" for trial in trials for note in trial.notes]
+    notes = notes_of(trials)
     if strange:
         notes += told + other_units(rig, model, features)
         if model.base == Model.base:
@@ -231,6 +231,15 @@ def prepare(
             f"fewer than five closures of {', '.join(few)}: the repeatability is a guess from the priors"
         )
     return Prepared(rig, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))
+
+
+def notes_of(trials: Sequence[Trial]) -> list[str]:
+    """What is to be said of the recordings; what is said of several of them stands once, with all their names."""
+    of: dict[str, list[str]] = {}
+    for trial in trials:
+        for note in trial.notes:
+            of.setdefault(note, []).append(trial.name)
+    return [f"{', '.join(dict.fromkeys(names))}: {note}" for note, names in of.items()]
 
 
 def drifts(features: Features, machine: str = "hand") -> list[str]:
