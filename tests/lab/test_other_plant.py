@@ -53,6 +53,14 @@ def test_an_error_in_one_signal_of_one_condition_is_not_lost_in_the_sum_over_all
     where, error = worst_error(search, null)
     assert error < 1.0 and is_adequate(search, null, limits)
 
+    # What chance makes is the model's own error and the scatter of the closures; the latter does not count.
+    rng = np.random.default_rng(2)
+    drawn = [
+        [e for _, e in search.problem.own_errors(rng.standard_normal(null.fit.residual.size))]
+        for _ in range(60)
+    ]
+    assert np.sqrt(np.mean(np.square(drawn), axis=0)) == pytest.approx(1.0, abs=0.35)
+
     problem, k = search.problem, 2
     block, rows = problem.features.blocks[k], problem.features.slices[k]
     wave = np.zeros(problem.features.size)
@@ -62,7 +70,7 @@ def test_an_error_in_one_signal_of_one_condition_is_not_lost_in_the_sum_over_all
     assert off.fit.cost < limits.misfit, "in the sum it is small"
     where, error = worst_error(search, off)
     assert where == f"{block.signal} of '{block.condition}'"
-    assert error == pytest.approx(3.0) and error > OWN_ERROR_MOST
+    assert error == pytest.approx(3.0, rel=1e-3) and error > OWN_ERROR_MOST
     assert not is_adequate(search, off, limits)
     said = shortfall(search, off, limits)
     assert said.startswith(f"error in {where} is 3.0 times"), said

@@ -127,6 +127,13 @@ def test_equations_by_hand() -> None:
     along = [evaluate(load_effect("cogging"), ripple, {Q: 3.0 * k / 8})[TORQUE] for k in range(8)]
     assert along[0] == pytest.approx(0.02) and along[2] == pytest.approx(0.01)
     assert sum(along) == pytest.approx(0.0, abs=1e-12)
+    wave = ripple | {"second_sine": 0.2, "second_cosine": -0.1, "third_sine": 0.15, "third_cosine": 0.05}
+    for q in (0.0, 0.4, 1.1, 2.6):
+        x = 2.0 * math.pi * q / 3.0 + math.atan2(0.02, 0.01)
+        of_first = math.sin(x) + 0.2 * math.sin(2.0 * x) - 0.1 * math.cos(2.0 * x)
+        of_first += 0.15 * math.sin(3.0 * x) + 0.05 * math.cos(3.0 * x)
+        there = evaluate(load_effect("cogging"), wave, {Q: q})[TORQUE]
+        assert there == pytest.approx(math.hypot(0.01, 0.02) * of_first)
     glove = evaluate(load_effect("glove_stiffness"), {"stiffness": 1e-3, "hardening": 1e-6}, {QL: 10.0})
     assert glove.sum() == pytest.approx(-(1e-3 * 10 + 1e-6 * 1000))
     states = np.zeros(1)
@@ -139,6 +146,14 @@ def test_equations_by_hand() -> None:
         )
     # T = Rth R i2 / (1 - alpha Rth R i2): the resistance grows with the temperature
     assert states[0] == pytest.approx(15.0 / (1 - 0.0039 * 15.0), rel=1e-3)
+
+
+def test_what_is_usual_is_said_of_shapes_only() -> None:
+    usual = {"unit": "1", "lower": -1.0, "upper": 1.0, "typical": 0.0}
+    assert EffectParameter("form", **usual, sd=0.2).sd == 0.2
+    for wrong in ({"sd": -0.1}, {"sd": 0.2, "vanishing": 0.0}):
+        with pytest.raises(HannesError, match="'form': sd"):
+            EffectParameter("form", **usual, **wrong)
 
 
 def test_own_effect_from_a_file(tmp_path: Path, nominal: list[Rollout]) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 from .chance import Chance
-from .search import Candidate, Search
+from .search import FAR, PULLED, Candidate, Search
 
 ADEQUATE = 1.25
 """A set of effects is adequate if its cost is at most this multiple of what chance reaches: room for the linear
@@ -18,10 +20,14 @@ IMPLAUSIBLE = 8.0
 """Standard deviations of its prior at which a nominal parameter is called far off, and beyond which no set of effects
 that needs it there is adequate: an effect may fit well whose only merit is that it replaces what the model had."""
 
+DISTORTED = 2.5
+"""Standard deviations, root of the sum of the squares, that the shapes of one effect may be off from what is usual of
+them: an effect that is bent further stands for another curve."""
+
 
 def is_adequate(search: Search, candidate: Candidate, limits: Chance, room: float = ADEQUATE) -> bool:
     """Whether chance, with the model's own error if it has one, explains what a set leaves."""
-    if apart(search, candidate) or implausible(candidate):
+    if apart(search, candidate) or implausible(candidate) or distorted(candidate):
         return False
     if search.problem.discrepancy:
         return candidate.fit.cost <= limits.misfit and worst_error(search, candidate)[1] <= OWN_ERROR_MOST
@@ -63,11 +69,38 @@ def implausible(candidate: Candidate) -> str:
     )
 
 
+def distorted(candidate: Candidate) -> str:
+    """The effect whose shapes are farther off from what is usual of them than DISTORTED, in words; empty if none is."""
+    fit = candidate.fit
+    shapes: dict[str, list[tuple[float, str]]] = {}
+    for c, z in zip(fit.coordinates, fit.z, strict=True):
+        if c.form:
+            shapes.setdefault(c.name.partition(".")[0], []).append((abs(float(z)), c.name))
+    for effect, own in shapes.items():
+        if math.hypot(*(z for z, _ in own)) > DISTORTED:
+            name = max(own)[1]
+            return (
+                f"{effect} would be of another form than is usual of it ({name} {fit.values[name]:.2g}): it stands for "
+                "something else"
+            )
+    return ""
+
+
+def leads_back(base: Candidate, other: Candidate | None = None) -> bool:
+    """Whether a set has all well-known parameters near their nominal values again of which its base has some far off.
+
+    They had taken over what an effect does.  Without a set: whether there is any to lead back.
+    """
+    known = base.fit.model.parameters
+    far = [c.name for c, off in base.fit.off if off > PULLED and not c.wide and c.name in known]
+    return bool(far) and (other is None or all(abs(other.fit.z_of(name) or 0.0) < FAR for name in far))
+
+
 def shortfall(search: Search, best: Candidate, limits: Chance) -> str:
     """In what a set that is not adequate falls short."""
     if best.fit.cost > limits.misfit:
         return f"misfit {best.fit.cost:.0f} stays above what chance reaches ({limits.misfit:.0f})"
-    if off := apart(search, best) or implausible(best):
+    if off := apart(search, best) or implausible(best) or distorted(best):
         return off
     where, error = worst_error(search, best)
     return f"error in {where} is {error:.1f} times as large as a model of this form is allowed to be off"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from hannes_description.errors import HannesError
 
-from .adequacy import is_adequate, shortfall
+from .adequacy import is_adequate, leads_back, shortfall
 from .chance import Chance, chance
 from .diagnosis import Rank
 from .features import Features
@@ -20,7 +20,8 @@ WORTHWHILE = 0.05
 
 OWN_ERROR_PART = 0.12
 """The same where the model has an error of its own, also within chance: its width is assumed, and it is not noise.
-There a second effect must remove FURTHER times as much."""
+There a second effect must remove FURTHER times as much.  Not so one that leads back what is far off without it: the
+hand's own parameters had taken it over, and what is left of it is small."""
 
 TIE = 6.0
 """Sets whose penalised costs differ by less cannot be told apart: a likelihood ratio of e^3 = 20.  The best is the
@@ -92,24 +93,28 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
         if enough and size > 1:
             room = choice.limits.misfit - choice.limits.median
             front, far = [c for c in front if c.penalised <= front[0].penalised + room], []
-        needed = needed_gain(choice, choice.best, first=size == 1)
-        worth = choice.best.penalised - 0.5 * needed
+        first_one = size == 1
+        worth = choice.best.penalised - 0.5 * needed_gain(choice, choice.best, first=first_one)
         text = f"{COUNTS.get(size, size)} effect{'s' * (size > 1)}"
         round_ = _extended(choice, front, far, text, worth)
         if not round_:
             break
-        if size == 1 and _hard(choice, round_[0]):
+        if first_one and _hard(choice, round_[0]):
             again = search.thoroughly().extend(front, list(search.sources), "one effect, thoroughly", worth)
             round_ = _best_of(round_, again)
         if enough and round_[0].penalised < worth and set(choice.best.names) < set(round_[0].names):
             # The set without it may find its way further down from there; what is left is the gain.
             choice = replace(choice, best=choice.search.without(round_[0], choice.best.names))
         # What chance gains was found for effects of one free strength; further parameters pay their penalty.
-        gain = choice.best.penalised + PENALTY - round_[0].penalised
+        gains = [choice.best.penalised + PENALTY - c.penalised for c in round_]
+        needed = [needed_gain(choice, choice.best, c, first=first_one) for c in round_]
+        joins = next((k for k, gain in enumerate(gains) if gain >= needed[k]), None)
+        if joins:
+            round_ = [round_[joins], *(c for k, c in enumerate(round_) if k != joins)]
         # Within chance there is nothing to explain, unless an effect gains more than chance does.
-        whole = min(round_[0].fit.cost, limits.median) if gain >= needed else limits.median
+        whole = limits.median if joins is None else min(round_[0].fit.cost, limits.median)
         ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, whole)) for c in round_)
-        if gain < needed:
+        if joins is None:
             choice = replace(choice, ranking=ranking)
             break
         new = choice.search.renewed(round_[0])
@@ -195,11 +200,19 @@ def tie_width(search: Search, best: Candidate) -> float:
     return max(OWN_ERROR_TIE, TIED_PART * OWN_ERROR_PART * best.fit.cost)
 
 
-def needed_gain(choice: Choice, base: Candidate, *, first: bool = False) -> float:
-    """By how much a further effect must lower the penalised cost of a base; `first`: it is the first of the search."""
+def needed_gain(
+    choice: Choice, base: Candidate, extended: Candidate | None = None, *, first: bool = False
+) -> float:
+    """By how much a further effect must lower the penalised cost of a base; `first`: it is the first of the search.
+
+    extended    the base with that effect; without it, what the least is that any must gain
+    """
     limits = choice.limits
     enough = is_adequate(choice.search, base, limits, room=1.0)
-    part = OWN_ERROR_PART if choice.search.problem.discrepancy else 0.0 if enough else WORTHWHILE
+    if choice.search.problem.discrepancy:
+        part = 0.0 if leads_back(base, extended) else OWN_ERROR_PART
+    else:
+        part = 0.0 if enough else WORTHWHILE
     return max(limits.gain, part * base.fit.cost) * (FURTHER if enough and not first else 1.0)
 
 
@@ -212,7 +225,7 @@ def pruned(choice: Choice) -> Choice:
         ]
         part = min(parts, key=lambda c: c.penalised)
         gain = part.penalised + PENALTY - best.penalised
-        if gain >= needed_gain(choice, part) or not is_adequate(choice.search, part, choice.limits):
+        if gain >= needed_gain(choice, part, best) or not is_adequate(choice.search, part, choice.limits):
             break
         choice = cut_to(choice, part)
     return choice

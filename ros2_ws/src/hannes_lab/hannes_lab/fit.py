@@ -61,7 +61,11 @@ class Fit:
     @property
     def off(self) -> list[tuple[Coordinate, float]]:
         """Nuisance parameters with how many standard deviations of their priors they are off, farthest first."""
-        off = [(c, abs(float(z))) for c, z in zip(self.coordinates, self.z, strict=True) if c.prior]
+        off = [
+            (c, abs(float(z)))
+            for c, z in zip(self.coordinates, self.z, strict=True)
+            if c.prior and not c.form
+        ]
         return sorted(off, key=lambda item: -item[1])
 
     @property

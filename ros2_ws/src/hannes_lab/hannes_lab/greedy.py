@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from .adequacy import distorted
 from .errors import condition_error, held_out_condition_errors
 from .search import Candidate, Search
 
@@ -131,9 +132,11 @@ def _judge(
 ) -> _Judged:
     """The best of the best fits by held-out error; of those that are alike, the one with the fewest parameters.
 
+    An effect that must be bent into another form is no candidate while there are others.
     Each error counts in multiples of what it may be at most (LEFT_OPEN, or 1 - gain, of the mean square without it).
     """
-    judged = search.each(_polish_in_worker, [(c,) for c in candidates[:JUDGED]], f"{text}: polish")
+    sound = [c for c in candidates if not distorted(c)] or candidates
+    judged = search.each(_polish_in_worker, [(c,) for c in sound[:JUDGED]], f"{text}: polish")
     held = search.each(held_out_error, [(c, True) for c in judged], f"{text}: held-out conditions")
     left_open = [_left_open(search, candidate, base) for candidate in judged]
     most = [min(LEFT_OPEN, 1.0 - gain) if names else 1.0 - gain for names in left_open]
@@ -164,7 +167,7 @@ def _left_open(search: Search, candidate: Candidate, base: Candidate) -> str:
         if name in base.names:
             continue
         parameters = search.effect(name).parameters
-        own = {f"{name}.{p.name}": p.vanishing is not None for p in parameters}
+        own = {f"{name}.{p.name}": p.vanishing is not None for p in parameters if not p.sd}
         out += [n for n in own if known[n][0].at_end(*known[n][1:])]
         # z is 0 where a strength vanishes.
         strengths = [n for n, strength in own.items() if strength]

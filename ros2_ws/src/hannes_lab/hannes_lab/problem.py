@@ -49,9 +49,10 @@ simulation with dry friction."""
 class Coordinate:
     """One dimension of the search: maps z to a parameter's value.
 
-    prior    True for a nuisance parameter with a standard normal prior on z
+    prior    True for a parameter with a standard normal prior on z: a nuisance, or a `form`
     scale    value = offset + scale z, or offset exp(scale z) if log
     part     True for a part of a whole
+    form     True for a shape of an effect of which a usual value is known
     """
 
     name: str
@@ -64,6 +65,7 @@ class Coordinate:
     step: float
     unit: str = ""
     part: bool = False
+    form: bool = False
 
     @property
     def wide(self) -> bool:
@@ -130,10 +132,17 @@ def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
 
 
 def effect_coordinates(effect: EffectType) -> list[Coordinate]:
-    """z in units of the typical value; positive shape parameters on a logarithmic scale."""
+    """z in units of the typical value, or of what is usual about it; other positive shapes on a logarithmic scale."""
     out = []
     for p in effect.parameters:
-        if p.vanishing is None and p.lower > 0.0:
+        if p.sd:
+            name, step = f"{effect.name}.{p.name}", Nuisance.step
+            out.append(
+                Coordinate(
+                    name, p.typical, p.sd, False, p.lower, p.upper, True, step, p.unit, p.part, form=True
+                )
+            )
+        elif p.vanishing is None and p.lower > 0.0:
             # The last of many waves moves far when the period changes a little.
             step = 1e-4 if p.period else 0.03
             out.append(
@@ -213,20 +222,24 @@ class Problem:
         """Blocks for which the model has an error of its own, and how large their error is in its standard deviations.
 
         residual    whitened (size,)
-        The root mean square over the phases, each weighted by the precision that is expected of the model there.
+        The root mean square over the phases, without what noise and scatter of the closures add to it, each weighted by
+        the precision that is expected of the model there.
         """
-        raw, sd = np.empty_like(residual), np.full(residual.size, np.inf)
+        raw, noise, sd = np.empty_like(residual), np.empty_like(residual), np.full(residual.size, np.inf)
         for rows, lower in self.whitener:
             raw[rows] = lower @ residual[rows]
+            noise[rows] = (lower**2).sum(axis=1)
         for rows, lower in self.discrepancy:
-            sd[rows] = np.linalg.norm(lower, axis=1)
+            own = (lower**2).sum(axis=1)
+            sd[rows] = np.sqrt(own)
+            noise[rows] -= own
         out = []
         for block, both in zip(self.features.blocks, self.features.slices, strict=True):
             where = slice(both.start, both.start + block.phase.size)
             precision = sd[where] ** -2.0
             if precision.any():
-                square = float((raw[where] ** 2 * precision**2).sum() / precision.sum())
-                out.append((block, math.sqrt(square)))
+                square = float(((raw[where] ** 2 - noise[where]) * precision**2).sum() / precision.sum())
+                out.append((block, math.sqrt(max(square, 0.0))))
         return out
 
     def residual(self, model: Model, values: Mapping[str, float]) -> Array:

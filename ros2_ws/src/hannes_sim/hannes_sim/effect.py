@@ -44,6 +44,8 @@ class EffectParameter:
     part           True for a part of a whole: both ends of its range are values like any other
     period         True for a period in the motor's position: a search also starts from the lines in the spectrum of
                    the residual over the position
+    sd             of a shape: standard deviation of what is usual about `typical`.  Fits begin there and pay for what
+                   is farther off, as for a parameter of the machine; 0 where one value is as good as another
     """
 
     name: str
@@ -56,8 +58,13 @@ class EffectParameter:
     starts: tuple[float, ...] = ()
     period: bool = False
     part: bool = False
+    sd: float = 0.0
 
     def __post_init__(self) -> None:
+        if self.sd < 0.0 or (self.sd and self.vanishing is not None):
+            raise HannesError(
+                f"Effect parameter '{self.name}': sd {self.sd}; it is at least 0, and of a shape (no `vanishing`) only."
+            )
         if not self.lower <= self.typical <= self.upper:
             raise HannesError(
                 f"Effect parameter '{self.name}': typical {self.typical} is outside "

@@ -6,12 +6,20 @@ from typing import Any
 from ..effect import Effect, EffectParameter
 from ..ports import TORQUE, Q
 
+USUAL, MOST = 0.2, 0.4
+"""Of the ripple's first harmonic: how large its second and third usually are, and may be."""
+
+
+def _of_the_first(name: str, description: str) -> EffectParameter:
+    return EffectParameter(name, "1", -MOST, MOST, 0.0, None, description, sd=USUAL)
+
 
 class Cogging(Effect):
     """A torque that is periodic in the motor side's angle.
 
-    Equation: tau = a sin(2 pi q / P) + b cos(2 pi q / P), of no mean, with any phase at the encoder's zero.
-    Limits: one harmonic; with a sampling of the current below its frequency it is seen through the position only.
+    Equation: tau = A (sin x + s2 sin 2x + c2 cos 2x + s3 sin 3x + c3 cos 3x), of no mean, where A sin x =
+    a sin(2 pi q / P) + b cos(2 pi q / P): any phase at the encoder's zero, and a wave that need not be a sine.
+    Limits: three harmonics; with a sampling of the current below its frequency it is seen through the position only.
     """
 
     name = "cogging"
@@ -30,6 +38,10 @@ class Cogging(Effect):
             starts=(0.3306939635357677, 1.65, 3.14159265, 6.283185307179586, 23.876),
             period=True,
         ),
+        _of_the_first("second_sine", "s2, part of A"),
+        _of_the_first("second_cosine", "c2, part of A"),
+        _of_the_first("third_sine", "s3, part of A"),
+        _of_the_first("third_cosine", "c3, part of A"),
     )
     looks_like = "the current wobbles with the angle, at the same angles in every closure and at every speed"
     told_by = "slow closures, current logged fast"
@@ -37,4 +49,10 @@ class Cogging(Effect):
     @staticmethod
     def contribute(x: Any, p: Any, s: Any, y: Any) -> None:
         angle = 2.0 * math.pi * x[Q] / p[2]
-        y[TORQUE] += p[0] * math.sin(angle) + p[1] * math.cos(angle)
+        amplitude = math.sqrt(p[0] * p[0] + p[1] * p[1])
+        if amplitude > 0.0:
+            sine = (p[0] * math.sin(angle) + p[1] * math.cos(angle)) / amplitude
+            cosine = (p[0] * math.cos(angle) - p[1] * math.sin(angle)) / amplitude
+            second = p[3] * 2.0 * sine * cosine + p[4] * (1.0 - 2.0 * sine * sine)
+            third = p[5] * sine * (3.0 - 4.0 * sine * sine) + p[6] * cosine * (4.0 * cosine * cosine - 3.0)
+            y[TORQUE] += amplitude * (sine + second + third)
