@@ -3,11 +3,15 @@
 import numpy as np
 from hannes_description.model import Model
 from hannes_lab.adequacy import distorted, leads_back
+from hannes_lab.diagnose import effect_sources
 from hannes_lab.fit import Fit
 from hannes_lab.hand import WIDE_STEP
+from hannes_lab.hide import make_set
+from hannes_lab.prepare import prepare
 from hannes_lab.problem import Coordinate, effect_coordinates, nuisance_coordinate
 from hannes_lab.rig import Nuisance
-from hannes_lab.search import Candidate
+from hannes_lab.search import Candidate, Search
+from hannes_lab.trials import make_trial
 from hannes_sim.effect import load_effect
 
 
@@ -32,15 +36,24 @@ def test_what_leads_a_known_parameter_back_is_worth_more() -> None:
 
 
 def test_an_effect_that_is_bent_into_another_one_explains_nothing() -> None:
-    """One place that resists is no ripple, though a wave of three harmonics may be as narrow."""
-    forms = [c for c in effect_coordinates(load_effect("cogging")) if c.form]
-    assert [c.name.partition(".")[2] for c in forms] == [
-        "second_sine",
-        "second_cosine",
-        "third_sine",
-        "third_cosine",
-    ]
-    assert not distorted(candidate(*((c, 0.9) for c in forms)))
-    said = distorted(candidate((forms[0], 2.0), (forms[2], -1.9)))
-    assert said.startswith("cogging would be of another form") and "second_sine 0.4" in said
-    assert all(c.at_end(2.0, 0.1) for c in forms), "and none may be larger than that"
+    """One place that resists is no ripple, though one wave of three harmonics may be as narrow; many waves are one."""
+    recordings, _ = make_set(Model.load(), [], seed=5, closures=2, conditions=("slow",))
+    prepared = prepare([make_trial(r) for r in recordings], Model.load())
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, effect_sources(only=["cogging"]))
+    coordinates = {c.name.partition(".")[2]: c for c in effect_coordinates(load_effect("cogging"))}
+    travel = prepared.rig.trials[0].span
+
+    def said(waves: float, **shapes: float) -> str:
+        period = coordinates["period"]
+        off = {name: shapes.get(name, 0.0) for name, c in coordinates.items() if c.form}
+        assert list(off) == ["second_sine", "second_cosine", "third_sine", "third_cosine"]
+        at = ((coordinates[name], z) for name, z in off.items())
+        return distorted(search, candidate((period, period.z(travel / waves)), *at))
+
+    assert not said(1.5, second_sine=1.0, third_cosine=-2.0)
+    assert not said(4.0, second_sine=3.0, third_cosine=-4.0)
+    bent = said(1.5, second_sine=3.0, third_cosine=-4.0)
+    assert (
+        bent.startswith("cogging, of 1.5 waves in all, would be of another form")
+        and "third_cosine -0.8" in bent
+    )

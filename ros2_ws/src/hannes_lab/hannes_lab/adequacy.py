@@ -20,14 +20,16 @@ IMPLAUSIBLE = 8.0
 """Standard deviations of its prior at which a nominal parameter is called far off, and beyond which no set of effects
 that needs it there is adequate: an effect may fit well whose only merit is that it replaces what the model had."""
 
-DISTORTED = 2.5
-"""Standard deviations, root of the sum of the squares, that the shapes of one effect may be off from what is usual of
-them: an effect that is bent further stands for another curve."""
+DISTORTED, WAVES = 2.5, 3.0
+"""Standard deviations, root of the sum of the squares, that the shapes of a periodic effect may be off from what is
+usual of them where fewer than so many of its waves fit into the travel: bent further it stands for a curve that does
+not repeat.  Waves that repeat may have any form: of the ripple of EMPS, 98 waves, the third harmonic is as large as the
+first."""
 
 
 def is_adequate(search: Search, candidate: Candidate, limits: Chance, room: float = ADEQUATE) -> bool:
     """Whether chance, with the model's own error if it has one, explains what a set leaves."""
-    if apart(search, candidate) or implausible(candidate) or distorted(candidate):
+    if apart(search, candidate) or implausible(candidate) or distorted(search, candidate):
         return False
     if search.problem.discrepancy:
         return candidate.fit.cost <= limits.misfit and worst_error(search, candidate)[1] <= OWN_ERROR_MOST
@@ -69,19 +71,19 @@ def implausible(candidate: Candidate) -> str:
     )
 
 
-def distorted(candidate: Candidate) -> str:
-    """The effect whose shapes are farther off from what is usual of them than DISTORTED, in words; empty if none is."""
+def distorted(search: Search, candidate: Candidate) -> str:
+    """The effect of few waves whose shapes are farther off than DISTORTED, in words; empty if none is."""
     fit = candidate.fit
-    shapes: dict[str, list[tuple[float, str]]] = {}
-    for c, z in zip(fit.coordinates, fit.z, strict=True):
-        if c.form:
-            shapes.setdefault(c.name.partition(".")[0], []).append((abs(float(z)), c.name))
-    for effect, own in shapes.items():
-        if math.hypot(*(z for z, _ in own)) > DISTORTED:
-            name = max(own)[1]
+    travel = max(trial.span for trial in search.problem.features.trials)
+    for effect in candidate.names:
+        parameters = search.effect(effect).parameters
+        waves = [travel / fit.values[f"{effect}.{p.name}"] for p in parameters if p.period]
+        shapes = {f"{effect}.{p.name}": fit.z_of(f"{effect}.{p.name}") or 0.0 for p in parameters if p.sd}
+        if waves and waves[0] < WAVES and math.hypot(*shapes.values()) > DISTORTED:
+            name = max(shapes, key=lambda n: abs(shapes[n]))
             return (
-                f"{effect} would be of another form than is usual of it ({name} {fit.values[name]:.2g}): it stands for "
-                "something else"
+                f"{effect}, of {waves[0]:.1f} waves in all, would be of another form than is usual of it "
+                f"({name} {fit.values[name]:.2g}): it stands for something else"
             )
     return ""
 
@@ -100,7 +102,7 @@ def shortfall(search: Search, best: Candidate, limits: Chance) -> str:
     """In what a set that is not adequate falls short."""
     if best.fit.cost > limits.misfit:
         return f"misfit {best.fit.cost:.0f} stays above what chance reaches ({limits.misfit:.0f})"
-    if off := apart(search, best) or implausible(best) or distorted(best):
+    if off := apart(search, best) or implausible(best) or distorted(search, best):
         return off
     where, error = worst_error(search, best)
     return f"error in {where} is {error:.1f} times as large as a model of this form is allowed to be off"

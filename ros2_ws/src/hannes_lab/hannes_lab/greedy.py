@@ -135,7 +135,7 @@ def _judge(
     An effect that must be bent into another form is no candidate while there are others.
     Each error counts in multiples of what it may be at most (LEFT_OPEN, or 1 - gain, of the mean square without it).
     """
-    sound = [c for c in candidates if not distorted(c)] or candidates
+    sound = [c for c in candidates if not distorted(search, c)] or candidates
     judged = search.each(_polish_in_worker, [(c,) for c in sound[:JUDGED]], f"{text}: polish")
     held = search.each(held_out_error, [(c, True) for c in judged], f"{text}: held-out conditions")
     left_open = [_left_open(search, candidate, base) for candidate in judged]

@@ -6,7 +6,7 @@ from typing import Any
 from ..effect import Effect, EffectParameter
 from ..ports import TORQUE, Q
 
-USUAL, MOST = 0.2, 0.4
+USUAL, MOST = 0.2, 1.0
 """Of the ripple's first harmonic: how large its second and third usually are, and may be."""
 
 
