@@ -13,6 +13,8 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.compare import Comparison, compare
 from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.diagnosis import Fall
+from hannes_lab.falls import error_falls
 from hannes_lab.features import compact_end
 from hannes_lab.fit import Fit, fit
 from hannes_lab.greedy import _left_open
@@ -343,6 +345,19 @@ def test_an_effect_that_may_be_nought_at_the_end_is_left_out(
     assert found.tied == (("coulomb_friction",),) and found.falls[-1].added == "coulomb_friction"
     assert any("cogging joined too" in note for note in found.notes)
     assert [effect.name for effect in found.model.effects] == ["coulomb_friction"]
+
+
+def test_an_effect_with_which_left_out_closures_are_foretold_worse_is_left_out(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def risen(*given: object, **how: object) -> tuple[Fall, ...]:
+        falls = error_falls(*given, **how)  # type: ignore[arg-type]
+        return (*falls[:-1], replace(falls[-1], held_out=1.1 * falls[-2].held_out))
+
+    monkeypatch.setattr("hannes_lab.diagnose.error_falls", risen)
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]))
+    assert [effect.name for effect in found.effects] == ["coulomb_friction"]
+    assert any("cogging joined too, but the error on held-out closures rises" in note for note in found.notes)
 
 
 def test_what_the_data_leave_open() -> None:

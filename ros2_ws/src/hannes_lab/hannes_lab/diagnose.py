@@ -126,10 +126,8 @@ def diagnose(
     verdict = "unknown" if not answered else "effects" if best.names else "nothing"
     tied = tied_sets(choice) if verdict == "effects" else ()
     best, left_out = search.with_spread(best), []
-    while greedy and len(best.names) > 1 and _may_be_nought(search, best, limits):
-        left_out.append(
-            f"{best.names[-1]} joined too, but by its 95 % intervals its strength may be nought: it is left out"
-        )
+    while greedy and len(best.names) > 1 and (why := _idle_at_the_end(search, best, limits, falls)):
+        left_out.append(f"{best.names[-1]} joined too, but {why}: it is left out")
         falls = falls[:-1]
         best = search.with_spread(search.found[key_of(best.names[:-1])])
         tied = (best.names,) if tied else ()
@@ -164,6 +162,16 @@ def diagnose(
         model=fitted_model(prepared.model, search, best, limits),
         values=best.fit.values,
     )
+
+
+def _idle_at_the_end(search: Search, found: Candidate, limits: Chance, falls: Sequence[Fall]) -> str:
+    """Why the last effect that was added greedily is none; empty if it is one."""
+    if _may_be_nought(search, found, limits):
+        return "by its 95 % intervals its strength may be nought"
+    before, after = falls[-2].held_out, falls[-1].held_out
+    if after > before:
+        return f"the error on held-out closures rises with it from {before:.3g} to {after:.3g} times the repeatability"
+    return ""
 
 
 def _may_be_nought(search: Search, found: Candidate, limits: Chance) -> bool:
