@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from hannes_description.errors import HannesError
 
-from .adequacy import is_adequate, leads_back, shortfall
+from .adequacy import distorted, is_adequate, leads_back, shortfall
 from .chance import Chance, chance
 from .diagnosis import Rank
 from .features import Features
@@ -84,7 +84,8 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
     Sets of one, two and three effects in turn; each round extends the best of the round before by every effect, so that
     two effects of which neither is best alone are found too.  After each round noise, scatter and critical values are
     estimated afresh at the best point: those of a wrong model are wrong.  Where the misfit is within chance already,
-    only sets that are as good as the best within chance are extended.
+    only sets that are as good as the best within chance are extended.  A set of which an effect must be bent into
+    another form counts only where there is no other.
     """
     choice = Choice(search, null, limits, is_adequate(search, null, limits), ())
     front, far = [null], list[Candidate]()
@@ -102,6 +103,7 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
         if first_one and _hard(choice, round_[0]):
             again = search.thoroughly().extend(front, list(search.sources), "one effect, thoroughly", worth)
             round_ = _best_of(round_, again)
+        round_ = [c for c in round_ if not distorted(choice.search, c)] or round_
         if enough and round_[0].penalised < worth and set(choice.best.names) < set(round_[0].names):
             # The set without it may find its way further down from there; what is left is the gain.
             choice = replace(choice, best=choice.search.without(round_[0], choice.best.names))
