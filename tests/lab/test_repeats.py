@@ -1,5 +1,7 @@
 """Of closures that repeat each other only as many are simulated as do not yet end as the one before."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hannes_description.model import Model
@@ -40,6 +42,18 @@ def simulated(trial: Trial, **hysteresis: float) -> tuple[list[int], float, floa
 
 def test_closures_of_one_condition_are_counted(trial: Trial) -> None:
     assert few(trial) == FEW and few(trial.only(trial.closures[:3])) == 3
+
+
+def test_conditions_one_after_the_other_are_simulated_whole(trial: Trial) -> None:
+    """All closures of the first are simulated anyway: none of them is taken for another."""
+    (*others, last) = trial.closures
+    block = replace(trial, closures=(*others, replace(last, condition="other")))
+    assert block.repeats == (0, *[1] * (len(others) - 1), len(others)) and block.in_turn
+    assert compact_end(block) is None and compact_end(trial) is not None
+    in_turn = tuple(replace(c, condition=f"{k % 2}") for k, c in enumerate(trial.closures))
+    laps = replace(trial, closures=in_turn)
+    assert laps.repeats == (0, 1, *[2, 3] * 4) and compact_end(laps) == end_of(trial, 4)
+    assert few(laps) == 2 * FEW
 
 
 def test_a_glove_that_creeps_back_within_a_few_closures(trial: Trial) -> None:

@@ -25,7 +25,7 @@ from hannes_lab.screen import usable_effects
 from hannes_lab.search import Candidate, Search
 from hannes_lab.spectrum import position_periods
 from hannes_lab.trials import find_moves
-from hannes_sim.effect import catalogue, load_effect
+from hannes_sim.effect import EffectParameter, catalogue, load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.rollout import rollout
 from lab.single_mass_rig import reference, write_files
@@ -209,6 +209,11 @@ def test_units_scale_by_dimension() -> None:
         and linear_unit("rad/(N.m)") == "m/N"
         and linear_unit("kg.m2") == "kg"
     )
+    drawn = type(
+        "Drawn", (catalogue()["cogging"],), {"parameters": (EffectParameter("at", "rad", 0, 9, 2, sd=0.5),)}
+    )
+    (at,) = scaled_effect(drawn, tuple(sorted(sizes.items())), False).parameters
+    assert (at.typical, at.sd) == (pytest.approx(0.2), pytest.approx(0.05))
     for effect in catalogue().values():
         for p in scaled_effect(effect, tuple(sorted(sizes.items())), False).parameters:
             assert p.lower <= p.typical <= p.upper, f"{effect.name}.{p.name}"

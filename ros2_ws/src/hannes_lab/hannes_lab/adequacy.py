@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from .chance import Chance
 from .search import FAR, PULLED, Candidate, Search
+from .trials import Trial
 
 ADEQUATE = 1.25
 """A set of effects is adequate if its cost is at most this multiple of what chance reaches: room for the linear
@@ -71,10 +74,17 @@ def implausible(candidate: Candidate) -> str:
     )
 
 
+def _travel(trial: Trial) -> float:
+    """How far a recording's encoder goes, or, without one, its reference."""
+    if "encoder_position" in trial.signals:
+        return float(np.ptp(trial.signals["encoder_position"][1]))
+    return trial.span
+
+
 def distorted(search: Search, candidate: Candidate) -> str:
     """The effect of few waves whose shapes are farther off than DISTORTED, in words; empty if none is."""
     fit = candidate.fit
-    travel = max(trial.span for trial in search.problem.features.trials)
+    travel = max(_travel(trial) for trial in search.problem.features.trials)
     for effect in candidate.names:
         parameters = search.effect(effect).parameters
         waves = [travel / fit.values[f"{effect}.{p.name}"] for p in parameters if p.period]

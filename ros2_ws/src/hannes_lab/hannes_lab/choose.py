@@ -111,11 +111,13 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
         gains = [choice.best.penalised + PENALTY - c.penalised for c in round_]
         needed = [needed_gain(choice, choice.best, c, first=first_one) for c in round_]
         joins = next((k for k, gain in enumerate(gains) if gain >= needed[k]), None)
-        if joins:
-            round_ = [round_[joins], *(c for k, c in enumerate(round_) if k != joins)]
+        # Those that fit better, but gain less than is asked of them, are no rivals of the first that joins.
+        short = round_[: joins or 0]
+        round_ = [c for c in round_ if c not in short]
         # Within chance there is nothing to explain, unless an effect gains more than chance does.
         whole = limits.median if joins is None else min(round_[0].fit.cost, limits.median)
-        ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, whole)) for c in round_)
+        ranked = [*round_[:1], *short, *round_[1:]]
+        ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, whole)) for c in ranked)
         if joins is None:
             choice = replace(choice, ranking=ranking)
             break

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from hannes_description.model import Model
-from hannes_sim.measurement import sample_noise
 from numpy.typing import NDArray
 
 from .depends import Dependence, residual_dependences
@@ -26,7 +25,8 @@ from .wording import clock_note
 Array = NDArray[np.float64]
 
 CONTACT, CONTACT_OVER_NOISE = 0.02, 5.0
-"""There is contact where the grip force exceeds this part of its greatest value, and this multiple of its noise."""
+"""There is contact where the grip force exceeds what it is at rest by this part of its greatest value, and by this
+multiple of what it varies there."""
 
 FALSE_DISCOVERY_RATE = 0.05
 DRAWS = 2000
@@ -198,8 +198,11 @@ def _contact(prepared: Prepared, values: Mapping[str, float]) -> dict[int, tuple
                 continue
             force = run["grip_force"]
             time = np.arange(force.size, dtype=np.float64) * trial.period
-        least = max(CONTACT * float(force.max()), CONTACT_OVER_NOISE * sample_noise(force))
-        touching = force > least
+        ticks = np.arange(trial.reference.size) * trial.period
+        away = np.interp(time, ticks, trial.reference - trial.reference[0])
+        rest = force[np.abs(away) < CONTACT * trial.span]
+        zero, noise = (float(np.median(rest)), float(rest.std())) if rest.size else (0.0, 0.0)
+        touching = force - zero > max(CONTACT * float((force - zero).max()), CONTACT_OVER_NOISE * noise)
         out[k] = (time, touching.astype(float)) if touching.any() else None
     return out
 

@@ -36,8 +36,11 @@ EXCESS_OVER_NOMINAL = 2.0
 (A).  The nominal hand's current is less to be trusted than that of another recording of the same hand."""
 
 LEAST_FORCE, OVER_NOISE = 0.5, 8.0
-"""N, and multiples of how much it varies in the free travel, by which a recorded grip force rises where there is an
-object."""
+"""N, and multiples of how much it varies before anything is touched, by which a recorded grip force rises where
+there is an object."""
+
+TOUCHES = 0.05
+"""Part of the way before which nothing is touched."""
 
 LEAST_FREE = 0.8
 """Part of the nominal hand's current that a free hand takes at least, whatever another recording shows that brakes."""
@@ -198,18 +201,20 @@ def _felt(trial: Trial, model: Model) -> tuple[float, float] | None:
     position = trial.mean_closure("encoder_position", phase)
     force = savgol_filter(trial.mean_closure("grip_force", phase), _window(phase, _span(trial)), 1)
     top = int(np.argmax(position))
-    free = position[: top + 1] < FREE_TRAVEL * position[top]
-    if free.sum() < 4:
+    still = position[: top + 1] < TOUCHES * position[top]
+    if still.sum() < 4:
         return None
-    zero, noise = float(np.median(force[: top + 1][free])), float(np.std(force[: top + 1][free]))
+    zero, noise = float(np.median(force[: top + 1][still])), float(np.std(force[: top + 1][still]))
     peak = int(np.argmax(force[: top + 1]))
-    if force[peak] - zero < max(LEAST_FORCE, OVER_NOISE * noise) or not free[0]:
+    if force[peak] - zero < max(LEAST_FORCE, OVER_NOISE * noise) or not still[0]:
         return None
     q, rise = np.maximum.accumulate(position[: peak + 1]), force[: peak + 1] - zero
     (start, low), (stop, high) = (_last_rise(q, rise, part * float(rise[-1])) for part in RISE)
     slope = max(high - low, 1e-6) / max(stop - start, 1e-3)
+    if start - low / slope < TOUCHES * position[top]:
+        return None  # what rises with the position from its beginning on is the hand's own, or crosstalk
     stiffness = slope * model.parameters.value("hand.fingertip_travel")
-    return float(np.clip(stiffness, 1e-3, 5.0)), max(start - low / slope, 0.0)
+    return float(np.clip(stiffness, 1e-3, 5.0)), start - low / slope
 
 
 def _still(time: Array, position: Array, current: Array, span: float, model: Model, *, braked: bool) -> Array:

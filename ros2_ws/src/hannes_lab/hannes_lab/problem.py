@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from hannes_description.model import EffectEntry, Model
@@ -33,6 +34,9 @@ Array = NDArray[np.float64]
 
 DISCREPANCY_LENGTH = 0.1
 """Part of a closure over which the model's own error stays alike."""
+
+CHANCE = 2.0
+"""Standard deviations above its mean that noise may make the sum of squares of a signal without being an error."""
 
 FAILED = 1e3
 """Whitened residual of a simulation that diverged: a large finite penalty."""
@@ -222,24 +226,42 @@ class Problem:
         """Blocks for which the model has an error of its own, and how large their error is in its standard deviations.
 
         residual    whitened (size,)
-        The root mean square over the phases, without what noise and scatter of the closures add to it, each weighted by
-        the precision that is expected of the model there.
+        The root mean square over the phases, each weighted by the precision that is expected of the model there,
+        without what noise and scatter of the closures add to it by chance.
         """
-        raw, noise, sd = np.empty_like(residual), np.empty_like(residual), np.full(residual.size, np.inf)
+        raw = np.empty_like(residual)
         for rows, lower in self.whitener:
             raw[rows] = lower @ residual[rows]
-            noise[rows] = (lower**2).sum(axis=1)
-        for rows, lower in self.discrepancy:
-            own = (lower**2).sum(axis=1)
-            sd[rows] = np.sqrt(own)
-            noise[rows] -= own
+        return [
+            (block, math.sqrt(max(float(weight @ raw[where] ** 2) - by_chance, 0.0)))
+            for block, where, weight, by_chance in self._judged
+        ]
+
+    @cached_property
+    def _judged(self) -> list[tuple[Block, slice, Array, float]]:
+        """Per block with an error of the model's own: where its mean closure stands, the weights (p,) of its squares,
+        and what noise and scatter make of their sum: the mean, and CHANCE standard deviations of Gaussian noise.
+        """
+        own = np.zeros(self.features.size)
+        of = {int(rows[0]): lower @ lower.T for rows, lower in self.discrepancy}
+        covariances: dict[int, tuple[int, Array]] = {}
+        for rows, lower in self.whitener:
+            first = int(rows[0])
+            if first in of:
+                own[rows] = of[first].diagonal()
+                covariance = lower @ lower.T - of[first]
+                covariances |= {int(row): (k, covariance) for k, row in enumerate(rows)}
         out = []
         for block, both in zip(self.features.blocks, self.features.slices, strict=True):
             where = slice(both.start, both.start + block.phase.size)
-            precision = sd[where] ** -2.0
-            if precision.any():
-                square = float(((raw[where] ** 2 - noise[where]) * precision**2).sum() / precision.sum())
-                out.append((block, math.sqrt(max(square, 0.0))))
+            if own[where].any():
+                precision = 1.0 / own[where]
+                weight = precision**2 / precision.sum()
+                k, covariance = covariances[where.start]
+                part = covariance[k : k + block.phase.size, k : k + block.phase.size]
+                mean = float(weight @ part.diagonal())
+                spread = math.sqrt(2.0 * float(weight @ part**2 @ weight))
+                out.append((block, where, weight, mean + CHANCE * spread))
         return out
 
     def residual(self, model: Model, values: Mapping[str, float]) -> Array:

@@ -18,7 +18,7 @@ FEW = 4
 these do not."""
 
 WORTH = 0.7
-"""Part of a recording below which its first FEW closures are worth being simulated alone."""
+"""Part of a recording below which its first closures, FEW of each condition, are worth being simulated alone."""
 
 MARGIN = 60
 """Ticks beyond the end of a closure: a logger shows its last ones later."""

@@ -491,6 +491,7 @@ def scaled_effect(kind: EffectType, sizes: tuple[tuple[str, float], ...], linear
                 upper=p.upper * f,
                 typical=p.typical * f,
                 vanishing=None if p.vanishing is None else p.vanishing * f,
+                sd=p.sd * f,
                 starts=tuple(min(max(v * f, p.lower * f), p.upper * f) for v in p.starts),
             )
         )

@@ -16,7 +16,7 @@ from .falls import NO_REPEATS, fall_sentence
 from .fit import Fit, fit
 from .problem import Problem, nuisance_coordinate
 from .rig import Nuisance
-from .search import FAR, PENALTY, Candidate, Search
+from .search import FAR, PENALTY, Candidate, Search, key_of
 
 ANY_DIFFERENCE = (
     "a difference of any size counts here that chance does not explain; no simple model of a real machine is that "
@@ -113,7 +113,7 @@ def nearest_sentence(choice: Choice) -> str:
         return ""
     first = choice.ranking[0]
     gain = choice.best.penalised + PENALTY - first.cost
-    asked = needed_gain(choice, choice.best, first=True)
+    asked = needed_gain(choice, choice.best, choice.search.found.get(key_of(first.names)), first=True)
     return (
         f" The effect that comes nearest is {' + '.join(first.names)}: it lowers the misfit by {max(gain, 0.0):.0f}, "
         f"and {asked:.0f} are asked for."

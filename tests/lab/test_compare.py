@@ -1,0 +1,36 @@
+"""In which phases a comparison puts what was recorded."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hannes_description.model import Model
+from hannes_lab.compare import compare
+from hannes_lab.hide import make_set
+from hannes_lab.prepare import prepare
+from hannes_lab.trials import Trial, make_trial
+
+
+@pytest.fixture(scope="module")
+def empty() -> Trial:
+    recordings, _ = make_set(Model.load(), [], seed=5, closures=5, conditions=("fast",))
+    return make_trial(recordings[0])
+
+
+@pytest.mark.parametrize("presses", [False, True])
+def test_there_is_contact_where_the_dynamometer_shows_more_than_it_does_at_rest(
+    empty: Trial, presses: bool
+) -> None:
+    """It reads 2 N at rest, in steps of 0.1 N, and is noisy; on nothing there is no greatest grip force either."""
+    time, position = empty.signals["encoder_position"]
+    force = 2.0 + 0.03 * np.random.default_rng(3).standard_normal(time.size)
+    if presses:
+        force = force + 2.0 * np.maximum(position - 8.0, 0.0)
+    force = (time, np.round(force, 1))
+    found = compare(prepare([replace(empty, signals={**empty.signals, "grip_force": force})], Model.load()))
+    phases = {cell.phase for cell in found.cells}
+    assert {"void", "opening"} <= phases and ("grasp" in phases) == presses
+    assert any(row.name == "maximum_grip_force" for row in found.metrics) == presses
+    (shown,) = (o for o in found.overlays if o.signal == "encoder_position")
+    touched = np.asarray(shown.measured)[np.asarray(shown.phase) == "grasp"]
+    assert not presses or touched.min() == pytest.approx(8.6, abs=0.7)
