@@ -1,12 +1,23 @@
 """From recordings to trials: reference on the grid, closures, conditions, outliers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hannes_bags.recording import Channel, Recording
 from hannes_control.reference import half_sine
 from hannes_description.errors import HannesError
 from hannes_lab.prepare import without_outliers
-from hannes_lab.trials import find_closures, group_closures, make_trial, reference_on_grid, unique_names
+from hannes_lab.trials import (
+    Closure,
+    Trial,
+    find_closures,
+    group_closures,
+    in_blocks,
+    make_trial,
+    reference_on_grid,
+    unique_names,
+)
 
 
 def recording(
@@ -28,6 +39,42 @@ def recording(
         "motor_current": Channel(log, np.abs(position) * 0.02, "A", "motor_current"),
     }
     return Recording(channels, metadata or {}, "memory")
+
+
+def test_conditions_one_after_the_other_in_a_bag_are_recordings_of_their_own() -> None:
+    """Each may have its own object; what comes in turn, or describes itself, stays one recording."""
+    up = np.interp(np.arange(0.0, 2.0, 1e-3), [0.0, 0.5, 1.2, 1.5, 2.0], [0.0, 0.0, 8.0, 8.0, 0.0])
+    long = 1.2 * np.interp(np.arange(0.0, 2.6, 1e-3), [0.0, 0.5, 1.6, 1.9, 2.6], [0.0, 0.0, 8.0, 8.0, 0.0])
+    still = np.zeros(800)
+    reference = np.concatenate([*([up, still] * 3), *([long, still] * 2), still])
+    starts = [0.5 + 2.8 * k for k in range(3)] + [3 * 2.8 + 0.5 + 3.4 * k for k in range(2)]
+    names = ["s.1"] * 3 + ["s.2"] * 2
+    closures = tuple(Closure(a, a + 2.2, name) for a, name in zip(starts, names, strict=True))
+    time = np.arange(reference.size) * 1e-3
+    signals = {"encoder_position": (time, reference.copy()), "motor_current": (time[::10], reference[::10])}
+    whole = Trial("s", 1e-3, reference, signals, closures, notes=("said",))
+    one, two = in_blocks(whole)
+    assert (one.name, two.name) == ("s.1", "s.2") and (one.notes, two.notes) == (("said",), ())
+    assert len(one.closures) == 3 and len(two.closures) == 2
+    assert one.reference.size + two.reference.size == reference.size
+    for part, closure in ((one, closures[1]), (two, closures[4])):
+        own = part.closures[1]
+        for name in signals:
+            phase = np.linspace(0.05, 2.0, 40)
+            there, here = (
+                np.interp(c.start + phase, *t.signals[name]) for t, c in ((whole, closure), (part, own))
+            )
+            assert here == pytest.approx(there, abs=1e-6), name
+        tick = round(own.start / 1e-3)
+        assert np.array_equal(
+            part.reference[tick : tick + 1500], reference[round(closure.start / 1e-3) :][:1500]
+        )
+    assert two.reference[0] == 0.0 and 0.4 < two.closures[0].start <= 0.5
+    in_turn = tuple(replace(c, condition=f"s.{k % 2}") for k, c in enumerate(closures))
+    broken = (*closures[:4], replace(closures[4], condition="s.3"))
+    for other in (in_turn, broken):
+        assert len(in_blocks(replace(whole, closures=other))) == 1
+    assert len(in_blocks(replace(whole, options={"sensors": {}}))) == 1
 
 
 def test_closures_are_found_and_share_a_condition() -> None:

@@ -37,7 +37,7 @@ from .own_effect import check_own_effects
 from .prepare import Prepared, load_trials, prepare, read_trials
 from .rig import load_rig
 from .trials import SIGNALS as COMPARED
-from .trials import UNITS
+from .trials import UNITS, stem_of
 
 Bags = Annotated[list[Path], typer.Argument(help="Bags, or folders of bags; one bag may hold many closures.")]
 ModelFile = Annotated[str, typer.Option("--model", help="Model file, or the name of a shipped model.")]
@@ -176,7 +176,8 @@ def _prepared(
         if machine
         else load_trials(bags, scale=factors, objects=given, topics=_topics(topics))
     )
-    unknown = sorted(set(given).difference(*({t.name, *(part.name for part in t.parts)} for t in trials)))
+    known = ({t.name, stem_of(t.source), *(part.name for part in t.parts)} for t in trials)
+    unknown = sorted(set(given).difference(*known))
     if unknown:
         raise HannesError(
             f"--object names unknown conditions {', '.join(unknown)}; these bags have "

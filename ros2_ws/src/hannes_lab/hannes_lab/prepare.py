@@ -25,7 +25,7 @@ from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig, check_parameters
 from .settle import settle
 from .surrogate import rig_for
-from .trials import SIGNALS, Closure, NoClosure, Trial, compared, stem_of, trial_of, unique_names
+from .trials import SIGNALS, Closure, NoClosure, Trial, compared, in_blocks, stem_of, trial_of, unique_names
 from .units import in_si
 
 OUTLIER = 6.0
@@ -89,7 +89,7 @@ def load_trials(
     """Trials of all bags below the paths; names are made unique.
 
     scale    factors to SI by signal name; other units and signs are guessed from all recordings together
-    objects  what was grasped, by the name of the condition or of the bag
+    objects  what was grasped, by the name of the condition or of the bag; of several conditions in one bag by theirs
     topics   by signal name, the topic that carries it in all bags; None leaves the signal out
     Bags of a few closures each that repeat one condition become one trial (join.py).  Bags without a whole closure, and
     those that are there already, are left out with a note.
@@ -112,13 +112,14 @@ def load_trials(
         if twin is not None:
             left_out.append(f"'{bag}' is the same recording as '{twin.source}'")
             continue
-        given = objects or {}
-        said = [given[name] for name in (stem_of(str(bag)), trial.name) if name in given]
-        if said:
-            trial = replace(trial, options={**trial.options, "object": said[0]})
         condition = recording.metadata.get("condition")
         step = recording["reference_position"].period
-        loaded.append(Loaded(trial, None if condition is None else str(condition), step))
+        for part in in_blocks(trial):
+            given = objects or {}
+            said = [given[name] for name in (part.name, stem_of(str(bag)), trial.name) if name in given]
+            if said:
+                part = replace(part, options={**part.options, "object": said[0]})
+            loaded.append(Loaded(part, None if condition is None else str(condition), step))
     if not loaded:
         raise empty[0] if empty else HannesError("No bag was given.")
     first, *others = unique_names(join_repeats(loaded))
