@@ -243,7 +243,7 @@ class Problem:
         and what noise and scatter make of their sum: the mean, and CHANCE standard deviations of Gaussian noise.
         """
         own = np.zeros(self.features.size)
-        of = {int(rows[0]): lower @ lower.T for rows, lower in self.discrepancy}
+        of = {int(rows[0]): lower @ lower.T for rows, lower in self.discrepancy if rows.size}
         covariances: dict[int, tuple[int, Array]] = {}
         for rows, lower in self.whitener:
             first = int(rows[0])
