@@ -220,11 +220,11 @@ def test_units_scale_by_dimension() -> None:
 
 
 def test_what_the_table_shows_decides_whether_an_effect_joins(prepared: Prepared) -> None:
-    """The rule of --greedy, on the printed numbers: each effect takes 5 % of the mean square."""
+    """The rule of --greedy, on the printed numbers: each effect takes 15 % of the mean square."""
     found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]), greedy=True)
     errors = [fall.held_out_conditions for fall in found.falls[1:]]
     assert len(errors) == 3
-    assert all(b**2 <= 0.95 * a**2 for a, b in itertools.pairwise(errors))
+    assert all(b**2 <= 0.85 * a**2 for a, b in itertools.pairwise(errors))
 
 
 def test_little_explained_is_unknown(prepared: Prepared) -> None:
