@@ -22,7 +22,10 @@ def made(names: tuple[str, ...], cost: float, spring: float) -> Candidate:
 
 
 class Made:
-    """A search that finds what it is given, of recordings of another machine."""
+    """A search that finds what it is given, of recordings of another machine.
+
+    It has of Search what `choose` calls, and no more.
+    """
 
     problem, slow, sources = SimpleNamespace(discrepancy=True), False, ("a", "b")
 
@@ -43,6 +46,10 @@ class Made:
 
     def without(self, larger: Candidate, names: tuple[str, ...]) -> Candidate:
         return NULL
+
+
+def search_of(*found: Candidate) -> Any:
+    return Made(*found)
 
 
 NULL = made((), 1000.0, 5.0)
@@ -66,14 +73,14 @@ def test_what_leads_back_joins_though_another_fits_better(given: pytest.MonkeyPa
     """The other gains 8 % where OWN_ERROR_PART is asked of it: it is neither the answer nor a tie."""
     assert np.isclose(OWN_ERROR_PART, 0.12)
     given.setattr(module, "_extended", lambda choice, front, *rest: [MORE, BACK] if front == [NULL] else [])
-    choice = choose(Made(MORE, BACK), NULL, LIMITS, 2)  # type: ignore[arg-type]
+    choice = choose(search_of(MORE, BACK), NULL, LIMITS, 2)
     assert choice.best.names == ("b",) and choice.rivals == ()
     assert [rank.names for rank in choice.ranking] == [("b",), ("a",)]
 
 
 def test_what_was_asked_of_the_nearest_effect_is_said(given: pytest.MonkeyPatch) -> None:
     given.setattr(module, "_extended", lambda choice, front, *rest: [MORE])
-    choice = choose(Made(MORE), NULL, LIMITS, 1)  # type: ignore[arg-type]
+    choice = choose(search_of(MORE), NULL, LIMITS, 1)
     assert choice.best.names == ()
     assert np.isclose(MORE.fit.cost, 920.0)
     assert "lowers the misfit by 80, and 120 are asked for" in nearest_sentence(choice)

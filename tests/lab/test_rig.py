@@ -5,6 +5,7 @@ import json
 import pickle
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -355,8 +356,8 @@ def test_an_effect_that_may_be_nought_at_the_end_is_left_out(
 def test_an_effect_with_which_left_out_closures_are_foretold_worse_is_left_out(
     prepared: Prepared, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def risen(*given: object, **how: object) -> tuple[Fall, ...]:
-        falls = error_falls(*given, **how)  # type: ignore[arg-type]
+    def risen(*given: Any, **how: Any) -> tuple[Fall, ...]:
+        falls = error_falls(*given, **how)
         return (*falls[:-1], replace(falls[-1], held_out=1.1 * falls[-2].held_out))
 
     monkeypatch.setattr("hannes_lab.diagnose.error_falls", risen)

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from .chance import Chance
+from .scan import period_of
 from .search import FAR, PULLED, Candidate, Search
 from .trials import Trial
 
@@ -84,15 +85,20 @@ def _travel(trial: Trial) -> float:
 def distorted(search: Search, candidate: Candidate) -> str:
     """The effect of few waves whose shapes are farther off than DISTORTED, in words; empty if none is."""
     fit = candidate.fit
-    travel = max(_travel(trial) for trial in search.problem.features.trials)
     for effect in candidate.names:
-        parameters = search.effect(effect).parameters
-        waves = [travel / fit.values[f"{effect}.{p.name}"] for p in parameters if p.period]
-        shapes = {f"{effect}.{p.name}": fit.z_of(f"{effect}.{p.name}") or 0.0 for p in parameters if p.sd}
-        if waves and waves[0] < WAVES and math.hypot(*shapes.values()) > DISTORTED:
+        kind = search.effect(effect)
+        period = period_of(kind)
+        if period is None:
+            continue
+        shapes = {
+            f"{effect}.{p.name}": fit.z_of(f"{effect}.{p.name}") or 0.0 for p in kind.parameters if p.sd
+        }
+        travel = max(_travel(trial) for trial in search.problem.features.trials)
+        waves = travel / fit.values[f"{effect}.{period.name}"]
+        if waves < WAVES and math.hypot(*shapes.values()) > DISTORTED:
             name = max(shapes, key=lambda n: abs(shapes[n]))
             return (
-                f"{effect}, of {waves[0]:.1f} waves in all, would be of another form than is usual of it "
+                f"{effect}, of {waves:.1f} waves in all, would be of another form than is usual of it "
                 f"({name} {fit.values[name]:.2g}): it stands for something else"
             )
     return ""

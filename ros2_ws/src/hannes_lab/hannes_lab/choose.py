@@ -16,7 +16,7 @@ from .greedy import AS_IT_REPEATS, grow
 from .search import HOPELESS, PENALTY, Candidate, Search, key_of
 
 WORTHWHILE = 0.05
-"""A further effect must remove at least this part of the cost, or of the mean square error on held-out conditions."""
+"""A further effect must remove at least this part of the cost."""
 
 EACH_TAKES = 0.15
 """Part of the mean square error on held-out conditions that an effect must take where they are added one after another:

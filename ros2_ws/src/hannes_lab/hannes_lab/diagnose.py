@@ -362,5 +362,5 @@ def _nuisance_table(found: Fit, limits: Chance) -> dict[str, dict[str, Any]]:
             "unit": c.unit,
         }
         for c, z in zip(found.coordinates, found.z, strict=True)
-        if c.prior and not c.form
+        if c.nuisance
     }

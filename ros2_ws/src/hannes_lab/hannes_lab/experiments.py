@@ -137,7 +137,7 @@ def _open(rig: Rig, candidate: Candidate) -> list[Loose]:
     out = [
         (c, float(z), 1.0)
         for c, z in zip(fit.coordinates, fit.z, strict=True)
-        if c.prior and not c.form and "@" not in c.name
+        if c.nuisance and "@" not in c.name
     ]
     for nuisance in rig.nuisances(fit.model):
         family, its_own, _ = nuisance.name.partition("@")
@@ -155,7 +155,7 @@ def _found(candidate: Candidate) -> list[Loose]:
     return [
         (c, float(z), float(sd))
         for c, z, sd in zip(fit.coordinates, fit.z, fit.sd(), strict=True)
-        if c.form or not c.prior
+        if not c.nuisance
     ]
 
 

@@ -314,14 +314,13 @@ def compact_end(trial: Trial, most: float = NEARLY) -> int | None:
 
     most  mean difference of the references, in their span
     """
-    repeats = trial.repeats
-    bases = set(repeats)
+    bases = set(trial.repeats)
     alone = len(trial.closures) <= len(bases) or (trial.anew and len(trial.conditions) != 1)
     # Conditions one after the other: what is simulated holds most closures, which need not repeat the second.
     alone |= not trial.anew and max(bases) + 1 > len(bases)
     if alone or not trial.in_turn or trial.apart > most:
         return None
-    return end_of(trial, max(repeats) + 1)
+    return end_of(trial, max(bases) + 1)
 
 
 def stands_for_all(trial: Trial) -> bool:

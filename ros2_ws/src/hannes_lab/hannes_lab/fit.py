@@ -61,11 +61,7 @@ class Fit:
     @property
     def off(self) -> list[tuple[Coordinate, float]]:
         """Nuisance parameters with how many standard deviations of their priors they are off, farthest first."""
-        off = [
-            (c, abs(float(z)))
-            for c, z in zip(self.coordinates, self.z, strict=True)
-            if c.prior and not c.form
-        ]
+        off = [(c, abs(float(z))) for c, z in zip(self.coordinates, self.z, strict=True) if c.nuisance]
         return sorted(off, key=lambda item: -item[1])
 
     @property

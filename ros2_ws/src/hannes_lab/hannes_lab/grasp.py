@@ -211,10 +211,11 @@ def _felt(trial: Trial, model: Model) -> tuple[float, float] | None:
     q, rise = np.maximum.accumulate(position[: peak + 1]), force[: peak + 1] - zero
     (start, low), (stop, high) = (_last_rise(q, rise, part * float(rise[-1])) for part in RISE)
     slope = max(high - low, 1e-6) / max(stop - start, 1e-3)
-    if start - low / slope < TOUCHES * position[top]:
+    place = start - low / slope
+    if place < TOUCHES * position[top]:
         return None  # what rises with the position from its beginning on is the hand's own, or crosstalk
     stiffness = slope * model.parameters.value("hand.fingertip_travel")
-    return float(np.clip(stiffness, 1e-3, 5.0)), start - low / slope
+    return float(np.clip(stiffness, 1e-3, 5.0)), place
 
 
 def _still(time: Array, position: Array, current: Array, span: float, model: Model, *, braked: bool) -> Array:

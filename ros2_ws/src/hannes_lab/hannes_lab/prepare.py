@@ -114,8 +114,8 @@ def load_trials(
             continue
         condition = recording.metadata.get("condition")
         step = recording["reference_position"].period
+        given = objects or {}
         for part in in_blocks(trial):
-            given = objects or {}
             said = [given[name] for name in (part.name, stem_of(str(bag)), trial.name) if name in given]
             if said:
                 part = replace(part, options={**part.options, "object": said[0]})

@@ -72,6 +72,11 @@ class Coordinate:
     form: bool = False
 
     @property
+    def nuisance(self) -> bool:
+        """True for a parameter of the machine or of a recording, not of an effect."""
+        return self.prior and not self.form
+
+    @property
     def wide(self) -> bool:
         """True for a nuisance parameter with a wide prior: its step, in standard deviations, is a small one."""
         return self.prior and self.step < Nuisance.step

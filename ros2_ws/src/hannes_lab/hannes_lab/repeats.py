@@ -37,26 +37,24 @@ def came_back(run: Rollout, trial: Trial, most: float) -> bool:
 
     most  part of the reference's span by which its ends may differ
     """
-    ends: dict[str, list[int]] = {}
-    for closure in trial.closures:
-        end = round(closure.stop / trial.period)
-        if end < run.raw.shape[0]:
-            ends.setdefault(closure.condition, []).append(end)
-    pairs = [own[-2:] for own in ends.values() if len(own) > 1]
+    ends = [[round(trial.closures[k].stop / trial.period) for k in own] for own in trial.numbers.values()]
+    within = [[end for end in own if end < run.raw.shape[0]] for own in ends]
+    pairs = [own[-2:] for own in within if len(own) > 1]
     moved = [np.abs(run.raw[there, [R_Q, R_QL]] - run.raw[here, [R_Q, R_QL]]).max() for there, here in pairs]
     return bool(max(moved, default=0.0) <= most * trial.span)
 
 
 def few(trial: Trial) -> int:
     """How many closures of a trial it takes to have FEW of each condition, or all where there are fewer."""
-    return 1 + max(k for own in _numbers(trial) for k in own[:FEW])
+    return 1 + max(k for own in trial.numbers.values() for k in own[:FEW])
 
 
 def few_will_do(trial: Trial) -> bool:
     """Whether that is much less than the whole, and the others have the same reference, in the same order."""
+    count = few(trial)
     return (
-        few(trial) < len(trial.closures)
-        and end_of(trial, few(trial)) < WORTH * trial.reference.size
+        count < len(trial.closures)
+        and end_of(trial, count) < WORTH * trial.reference.size
         and trial.apart <= SAME
         and trial.in_turn
     )
@@ -66,7 +64,7 @@ def repeated(signals: Mapping[str, Array], trial: Trial) -> dict[str, Array]:
     """Signals of the whole trial from those of its few first closures: later ones repeat the last of theirs."""
     first = few(trial)
     places = []
-    for own in _numbers(trial):
+    for own in trial.numbers.values():
         like = trial.closures[[k for k in own if k < first][-1]]
         begin = round(like.start / trial.period)
         later = [trial.closures[k] for k in own if k >= first]
@@ -80,8 +78,3 @@ def repeated(signals: Mapping[str, Array], trial: Trial) -> dict[str, Array]:
             whole[start : start + one.size] = one
         out[name] = whole
     return out
-
-
-def _numbers(trial: Trial) -> list[list[int]]:
-    """Numbers of the closures of each condition."""
-    return [[k for k, c in enumerate(trial.closures) if c.condition == name] for name in trial.conditions]

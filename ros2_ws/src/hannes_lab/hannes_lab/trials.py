@@ -151,6 +151,14 @@ class Trial:
     def of(self, condition: str) -> tuple[Closure, ...]:
         return tuple(closure for closure in self.closures if closure.condition == condition)
 
+    @cached_property
+    def numbers(self) -> dict[str, list[int]]:
+        """Numbers of the closures of each condition."""
+        out: dict[str, list[int]] = {}
+        for k, closure in enumerate(self.closures):
+            out.setdefault(closure.condition, []).append(k)
+        return out
+
     @property
     def anew(self) -> bool:
         """True where parts begin as the first one does; a recording alone begins but once."""
@@ -163,12 +171,8 @@ class Trial:
         In one recording that is the second of its condition: the first one may be the first after the start.
         """
         if not self.anew:
-            own: dict[str, list[int]] = {}
-            for k, closure in enumerate(self.closures):
-                own.setdefault(closure.condition, []).append(k)
-            return tuple(
-                k if (of := own[c.condition]).index(k) == 0 else of[1] for k, c in enumerate(self.closures)
-            )
+            own = [self.numbers[closure.condition] for closure in self.closures]
+            return tuple(k if k == numbers[0] else numbers[1] for k, numbers in enumerate(own))
         # The first recording has the most closures; outliers may be missing.
         until = self.parts[1].begin
         base = {c.number: k for k, c in enumerate(self.closures) if 0.5 * (c.start + c.stop) < until}
