@@ -60,6 +60,17 @@ def scaled(**factors: float) -> Damage:
     return damage
 
 
+def one_after_the_other(first: Signals, *others: Signals) -> Signals:
+    """What a recorder that was not stopped between them has of them."""
+    out = first
+    for signals in others:
+        later = max(float(t[-1]) for t, _ in out.values()) + 0.05
+        out = {
+            n: (np.append(t, signals[n][0] + later), np.append(v, signals[n][1])) for n, (t, v) in out.items()
+        }
+    return out
+
+
 def write_bag(
     folder: Path,
     signals: Signals,

@@ -27,7 +27,7 @@ from hannes_lab.search import Candidate, Search, wide_starts
 from hannes_lab.trials import SAME, Closure, Trial, make_trial
 from hannes_sim.effect import load_effect, strength_of
 from hannes_sim.ports import R_QL
-from lab.foreign_bags import Signals, signals_of_set, write_set
+from lab.foreign_bags import Signals, one_after_the_other, signals_of_set, write_bag, write_set
 
 STRANGE = {
     "control.kp": 0.5,
@@ -73,6 +73,18 @@ def test_what_was_grasped_and_how_it_was_controlled_is_read_from_the_closures(tm
     loop = outer_loop(trials)
     assert loop is not None and loop.kp == pytest.approx(0.5, rel=0.25) and loop.ki == 0.0
     assert "sensors" not in read_bag(tmp_path / "bags" / "slow").metadata
+
+
+def test_closures_on_nothing_and_on_an_object_in_one_bag_are_two_recordings(tmp_path: Path) -> None:
+    """Though the reference is the same: only in one of them something is grasped."""
+    own = signals_of_set(conditions=("slow", "grasp"), closures=4, seed=9)
+    write_bag(tmp_path / "session", one_after_the_other(own["slow"], own["grasp"]))
+    trials = load_trials([tmp_path])
+    assert [(t.name, len(t.closures)) for t in trials] == [("session.1", 4), ("session.2", 4)]
+    seen = {t.name: t.options.get("object") for t in with_seen_objects(trials, Model.load())}
+    assert seen["session.1"] is None and seen["session.2"]["stiffness"] > 5e3
+    said = load_trials([tmp_path], objects={"session.2": "rigid"})
+    assert [t.options.get("object") for t in said] == [None, "rigid"]
 
 
 def test_a_strange_hand_lacks_nothing(tmp_path: Path) -> None:

@@ -7,13 +7,13 @@ import pytest
 from hannes_bags.recording import Channel, Recording
 from hannes_control.reference import half_sine
 from hannes_description.errors import HannesError
+from hannes_lab.blocks import in_blocks, told_apart
 from hannes_lab.prepare import without_outliers
 from hannes_lab.trials import (
     Closure,
     Trial,
     find_closures,
     group_closures,
-    in_blocks,
     make_trial,
     reference_on_grid,
     unique_names,
@@ -75,6 +75,48 @@ def test_conditions_one_after_the_other_in_a_bag_are_recordings_of_their_own() -
     for other in (in_turn, broken):
         assert len(in_blocks(replace(whole, closures=other))) == 1
     assert len(in_blocks(replace(whole, options={"sensors": {}}))) == 1
+
+
+def closures_with(travel: list[float], noise: float = 1e-3) -> Trial:
+    """Closures with one reference, of which each goes so far and takes current for what it is kept from."""
+    up = np.interp(np.arange(0.0, 2.8, 1e-3), [0.0, 0.5, 1.2, 1.5, 2.0], [0.0, 0.0, 8.0, 8.0, 0.0])
+    time = np.arange(len(travel) * up.size) * 1e-3
+    rng = np.random.default_rng(3)
+    position = np.concatenate([np.minimum(up, most) for most in travel])
+    log = time[::10]
+    signals = {
+        "encoder_position": (log, position[::10] + noise * rng.standard_normal(log.size)),
+        "motor_current": (log, (1.1 * np.tile(up, len(travel)) - position)[::10]),
+    }
+    closures = tuple(Closure(0.5 + 2.8 * k, 0.5 + 2.8 * k + 2.0, "s") for k in range(len(travel)))
+    return Trial("s", 1e-3, np.tile(up, len(travel)), signals, closures)
+
+
+def test_closures_on_an_object_are_a_condition_of_their_own_though_the_reference_is_the_same() -> None:
+    whole = told_apart(closures_with([8.0] * 5 + [5.0] * 4 + [6.5] * 2))
+    assert {name: len(whole.of(name)) for name in whole.conditions} == {"s.1": 5, "s.2": 4, "s.3": 2}
+    assert any("s.2 (4 closures from 14.5 s)" in note and "--object" in note for note in whole.notes)
+    assert [part.name for part in in_blocks(whole)] == ["s.1", "s.2", "s.3"]
+
+
+@pytest.mark.parametrize(
+    "travel",
+    [
+        pytest.param([8.0] * 4 + [5.0] + [8.0] * 4, id="an outlier"),
+        pytest.param([5.0] + [8.0] * 5, id="the first"),
+        pytest.param(list(np.linspace(8.0, 5.0, 9)), id="little by little"),
+        pytest.param([8.0, 5.0] * 4, id="in turn"),
+        pytest.param([8.0] * 4 + [7.95] * 4, id="hardly anything"),
+    ],
+)
+def test_other_changes_from_closure_to_closure_make_no_conditions(travel: list[float]) -> None:
+    trial = closures_with(travel)
+    assert told_apart(trial) is trial
+
+
+def test_what_a_recording_says_of_itself_is_not_doubted() -> None:
+    trial = replace(closures_with([8.0] * 5 + [5.0] * 4), options={"sensors": {}})
+    assert told_apart(trial) is trial
 
 
 def test_closures_are_found_and_share_a_condition() -> None:

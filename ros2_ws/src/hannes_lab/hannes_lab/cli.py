@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json as json_module
 import math
-import os
 import shlex
 import sys
 import time
@@ -19,6 +18,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.signals import SIGNALS
 from hannes_sim.effect import effect_source, load_effect, strength_of
+from joblib import cpu_count
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -103,7 +103,8 @@ NoCache = Annotated[
 ]
 ReportFile = Annotated[Path | None, typer.Option("--report", help="Write a self-contained HTML report here.")]
 
-_JOBS = max(1, os.cpu_count() or 1)
+_JOBS = max(1, cpu_count())
+"""Cores that this process may use: fewer than the machine has in a container or a batch job."""
 
 MANY_TIMES = 5.0
 """Model over measured value from which their ratio is shown instead of the relative error."""
@@ -446,17 +447,27 @@ def _show_experiments(console: Console, experiments: Sequence[Experiment]) -> No
         )
 
 
+_LISTED = 3
+"""Conditions that a line of the table names each; of more, the worst alone (all are in --json and the report)."""
+
+
 def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> None:
     table = Table(
         title=f"Error, in multiples of the repeatability between closures (1 = as good as the {machine} repeats)"
     )
     units = {s.signal: s.unit for fall in found.falls for s in fall.signals}
     signals = list(found.falls[-1].held_out_signals)
-    columns = ("model", "training closures", "held-out closures", "held-out conditions")
-    for name in (*columns, *(f"{s}, {units.get(s, '')}" for s in signals)):
-        table.add_column(name, justify="left" if name in ("model", "held-out conditions") else "right")
+    table.add_column("model", no_wrap=True)
+    for name in ("training\nclosures", "held-out\nclosures"):
+        table.add_column(name, justify="right")
+    table.add_column("held-out\nconditions", overflow="fold")
+    for signal in signals:
+        table.add_column(f"{signal.replace('_', chr(10), 1)}, {units.get(signal, '')}", justify="right")
     for k, fall in enumerate(found.falls):
         conditions = ", ".join(f"{c} {_number(v, 3)}" for c, v in fall.by_condition.items())
+        if len(fall.by_condition) > _LISTED:
+            worst = max(fall.by_condition, key=fall.by_condition.__getitem__)
+            conditions = f"at most {_number(fall.by_condition[worst], 3)}, {worst}"
         if len(fall.by_condition) > 1:
             conditions = f"{_number(fall.held_out_conditions, 3)} ({conditions})"
         table.add_row(

@@ -16,6 +16,7 @@ from hannes_sim.effect import call_own
 from scipy.special import ndtr
 
 from .adapter import check_rig, check_trials, other_units
+from .blocks import in_blocks, told_apart
 from .features import Features, build_features
 from .fit import fit
 from .grasp import with_seen_objects
@@ -25,7 +26,7 @@ from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig, check_parameters
 from .settle import settle
 from .surrogate import rig_for
-from .trials import SIGNALS, Closure, NoClosure, Trial, compared, in_blocks, stem_of, trial_of, unique_names
+from .trials import SIGNALS, Closure, NoClosure, Trial, compared, stem_of, trial_of, unique_names
 from .units import in_si
 
 OUTLIER = 6.0
@@ -115,7 +116,7 @@ def load_trials(
         condition = recording.metadata.get("condition")
         step = recording["reference_position"].period
         given = objects or {}
-        for part in in_blocks(trial):
+        for part in in_blocks(told_apart(trial)):
             said = [given[name] for name in (part.name, stem_of(str(bag)), trial.name) if name in given]
             if said:
                 part = replace(part, options={**part.options, "object": said[0]})

@@ -60,9 +60,6 @@ LONGEST_GAP = 5.0
 SAME = 5e-4
 """Mean difference of the references of two closures, in their span, up to which one repeats the other."""
 
-BLOCK_REST = 0.3
-"""s for which the hand rests before a block of closures that is taken as a recording of its own."""
-
 MOST_SHIFT = 15
 """Ticks by which a closure may begin earlier or later than where its reference was seen to move."""
 
@@ -512,52 +509,6 @@ def trial_of(recording: Recording, *, name: str | None = None, period: float = 1
         recording.sha256,
         tuple(notes),
     )
-
-
-def in_blocks(trial: Trial) -> list[Trial]:
-    """One recording for each condition where a recording that describes nothing holds several, one after the other.
-
-    Each may have its own object then, and is simulated by itself.  The recording stays whole where a condition has one
-    closure or comes again later, or where the hand does not rest before a block.
-    """
-    order = [condition for condition, _ in itertools.groupby(c.condition for c in trial.closures)]
-    if len(order) < 2 or len(order) != len(trial.conditions) or "sensors" in trial.options:
-        return [trial]
-    blocks = [trial.of(condition) for condition in order]
-    rests = [_rest_before(trial, block[0]) for block in blocks]
-    if min(map(len, blocks)) < 2 or min(rests[1:]) < BLOCK_REST:
-        return [trial]
-    begins = [
-        0,
-        *(
-            round((b[0].start - 0.5 * min(r, 1.0)) / trial.period)
-            for b, r in zip(blocks[1:], rests[1:], strict=True)
-        ),
-    ]
-    parts: list[Trial] = []
-    for block, begin, end in zip(blocks, begins, [*begins[1:], trial.reference.size], strict=True):
-        origin, stop = begin * trial.period, end * trial.period
-        inside = {name: (time >= origin) & (time < stop) for name, (time, _) in trial.signals.items()}
-        parts.append(
-            replace(
-                trial,
-                name=block[0].condition,
-                reference=trial.reference[begin:end],
-                signals={n: (t[inside[n]] - origin, v[inside[n]]) for n, (t, v) in trial.signals.items()},
-                closures=tuple(replace(c, start=c.start - origin, stop=c.stop - origin) for c in block),
-                notes=trial.notes if not parts else (),
-            )
-        )
-    return parts
-
-
-def _rest_before(trial: Trial, closure: Closure) -> float:
-    """s for which the reference stands before a closure begins."""
-    at = round(closure.start / trial.period)
-    moves = np.flatnonzero(
-        np.abs(trial.reference[: at + 1] - trial.reference[max(at, 0)]) > RESTS * trial.span
-    )
-    return (at - (int(moves[-1]) if moves.size else 0)) * trial.period
 
 
 def _closures(count: int) -> str:
