@@ -83,8 +83,32 @@ class Model:
     def with_values(
         self, values: Mapping[str, float], *, status: str | None = None, source: str | None = None
     ) -> Model:
-        """Other values of named parameters (dotted names)."""
-        return replace(self, parameters=self.parameters.with_values(values, status=status, source=source))
+        """Other values of named parameters (dotted names), of the model or of its effects."""
+        effects = []
+        for effect in self.effects:
+            names = {f"{effect.name}.{n}": n for n in effect.parameters}
+            own = {
+                names[name]: self.named(name).at(value, status=status, source=source)
+                for name, value in values.items()
+                if name in names
+            }
+            values = {name: value for name, value in values.items() if name not in names}
+            effects.append(replace(effect, parameters={**effect.parameters, **own}) if own else effect)
+        parameters = self.parameters.with_values(values, status=status, source=source)
+        return replace(self, parameters=parameters, effects=tuple(effects))
+
+    def named(self, name: str) -> Parameter:
+        """A parameter by its dotted name: one of an effect of the model, or one of its own."""
+        kind, _, own = name.partition(".")
+        for effect in self.effects:
+            if effect.name == kind and own in effect.parameters:
+                return effect.parameters[own]
+        return self.parameters[name]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Dotted names of all parameters, those of the effects last."""
+        return (*self.parameters, *(f"{e.name}.{n}" for e in self.effects for n in e.parameters))
 
     def with_effect(self, entry: EffectEntry) -> Model:
         """Add an effect, or replace the one of the same name."""
@@ -178,7 +202,7 @@ class Model:
             base=str(base_path),
             controller=_beside(str(content.get("controller", "double_pid")), path.parent),
             variant=variant,
-            effects=_read_effects(content.get("effects") or [], where),
+            effects=_read_effects(content.get("effects") or [], where, path.parent),
             provenance=provenance,
         )
 
@@ -189,7 +213,7 @@ def _beside(name: str, folder: Path) -> str:
     return f"{(folder / file).resolve()}:{cls}" if file and (folder / file).is_file() else name
 
 
-def _read_effects(content: object, where: str) -> tuple[EffectEntry, ...]:
+def _read_effects(content: object, where: str, folder: Path) -> tuple[EffectEntry, ...]:
     if not isinstance(content, list):
         raise HannesError(f"{where}: 'effects' must be a list of entries with name and parameters.")
     entries = []
@@ -208,5 +232,7 @@ def _read_effects(content: object, where: str) -> tuple[EffectEntry, ...]:
             for n, p in item["parameters"].items()
         }
         source = item.get("source")
-        entries.append(EffectEntry(str(item["name"]), parameters, str(source) if source else None))
+        entries.append(
+            EffectEntry(str(item["name"]), parameters, _beside(str(source), folder) if source else None)
+        )
     return tuple(entries)

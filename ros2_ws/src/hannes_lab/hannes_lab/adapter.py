@@ -62,6 +62,11 @@ def check_rig(rig: Rig, model: Model) -> list[str]:
         near = get_close_matches(unknown, catalogue(), 1)
         meant = f"; is '{near[0]}' meant?" if near else f": {', '.join(catalogue())}."
         raise HannesError(f"{who}.without names '{unknown}', which is no effect of the catalogue{meant}")
+    figures = [f"{name}.{p.name}" for name, kind in catalogue().items() for p in kind.known]
+    for name, value in rig.known.items():
+        number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        if name not in figures or not (number and math.isfinite(value)):
+            raise HannesError(f"{who}.known: '{name}': {value!r}; it takes numbers for {', '.join(figures)}.")
     notes = []
     if not sizes:
         usual = ", ".join(f"{size:g} {token}" for token, size in REFERENCE_SIZES.items() if token != "s")

@@ -65,7 +65,7 @@ def apart(search: Search, candidate: Candidate) -> str:
 
 def implausible(candidate: Candidate) -> str:
     """The well-known parameter that is farther off than IMPLAUSIBLE, in words; empty if none is."""
-    known = candidate.fit.model.parameters
+    known = candidate.fit.model.names
     c, off = next(((c, z) for c, z in candidate.fit.off if not c.wide and c.name in known), (None, 0.0))
     if c is None or off <= IMPLAUSIBLE:
         return ""
@@ -109,7 +109,7 @@ def leads_back(base: Candidate, other: Candidate | None = None) -> bool:
 
     They had taken over what an effect does.  Without a set: whether there is any to lead back.
     """
-    known = base.fit.model.parameters
+    known = base.fit.model.names
     far = [c.name for c, off in base.fit.off if off > PULLED and not c.wide and c.name in known]
     return bool(far) and (other is None or all(abs(other.fit.z_of(name) or 0.0) < FAR for name in far))
 

@@ -266,7 +266,7 @@ def _foretells(falls: Sequence[Fall]) -> bool:
 def fitted_model(model: Model, search: Search, best: Candidate, limits: Chance) -> Model:
     """The model with fitted nuisance parameters and effects, as it goes into a file."""
     values = best.fit.values
-    known = {n: v for n, v in values.items() if "@" not in n and n in model.parameters}
+    known = {n: v for n, v in values.items() if "@" not in n and n in model.names}
     out = model.with_values(known, status="identified", source=FITTED)
     intervals = intervals_of(best.fit, limits)
     for name in best.names:

@@ -157,6 +157,10 @@ def describe(effect: EffectType) -> dict[str, Any]:
             }
             for p in effect.parameters
         ],
+        "known": [
+            {"name": p.name, "unit": p.unit, "of_the_hand": p.typical, "description": p.description}
+            for p in effect.known
+        ],
     }  # fmt: skip
 
 
@@ -196,6 +200,10 @@ def section(found: Signature, picture: str, known: LookAlikes) -> str:
         out.append(
             f"| `{p.name}` | {p.unit} | {p.lower:g} .. {p.upper:g} | {p.typical:g} | {off} | {p.description} |"
         )
+    out += [
+        f"| `{p.name}` | {p.unit} | known of the machine | {p.typical:g} | | {p.description} |"
+        for p in effect.known
+    ]
     values = ", ".join(f"{n} {v:g}" for n, v in found.values.items())
     out += [
         "",

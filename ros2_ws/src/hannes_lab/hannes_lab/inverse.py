@@ -103,7 +103,7 @@ def _outputs(model: Model, get: Any, dt: float, q: Any, v: Any, force: Array) ->
     out = np.zeros((q.size, N_OUTPUTS))
     for entry in model.effects:
         kind = load_effect(entry.source or entry.name)
-        p = np.array([get(f"{entry.name}.{parameter.name}") for parameter in kind.parameters])
+        p = np.array([get(f"{entry.name}.{parameter.name}") for parameter in kind.figures()])
         _along(_compiled(kind.contribute), p, np.zeros(max(1, kind.states)), dt, q, v, force, out)
     return out
 

@@ -83,7 +83,7 @@ def _try(source: str, simulate: Simulate, motion: tuple[Array, Array], answer: C
 
 
 def _acts_switched_off(kind: EffectType, x: Array) -> bool:
-    off = np.array([p.typical if p.vanishing is None else p.vanishing for p in kind.parameters])
+    off = np.array([p.typical if p.vanishing is None else p.vanishing for p in kind.figures()])
     y = np.zeros(N_OUTPUTS)
     kind.contribute(x, off, np.zeros(max(kind.states, 1)), y)
     return bool(np.any(np.abs(y) > 1e-12))
@@ -95,7 +95,7 @@ def _without_number(kind: EffectType, source: str, time: Array, position: Array)
     Compiled, a NaN may vanish in a limiter and the effect would silently do nothing.
     """
     x, s, y = np.zeros(N_INPUTS), np.zeros(max(kind.states, 1)), np.zeros(N_OUTPUTS)
-    p = np.array([parameter.typical for parameter in kind.parameters])
+    p = np.array([parameter.typical for parameter in kind.figures()])
     velocity = np.gradient(position, time)
     x[DT] = float(np.median(np.diff(time)))
     for t, q, v in zip(time, position, velocity, strict=True):

@@ -164,6 +164,7 @@ class PlantRig:
                  from REFERENCE_SIZES; effects are scaled by them
     linear       True where position is in m and the drive gives N: units are named so
     without      effects that have no meaning here, with the reason
+    known        figures of this machine that effects need, as "gravity.turn": 1.0; without them those have no meaning
     floor, points, drive_signals, pooled, approximate, foreign, phases, machine, figures, experiments  see Rig
 
     Plants are built once per (model structure, trial) and then only re-parametrised.
@@ -174,6 +175,7 @@ class PlantRig:
     sizes: ClassVar[Mapping[str, float]] = {}
     linear: ClassVar[bool] = False
     without: Mapping[str, str] = {}
+    known: ClassVar[Mapping[str, float]] = {}
     floor: float = 2e-4  # replay of a reference logged by messages, and a plant of finite step
     points: int = 160
     drive_signals: tuple[str, ...] = ("motor_current", "motor_effort")
@@ -188,6 +190,7 @@ class PlantRig:
 
     def __init__(self, trials: Sequence[Trial]) -> None:
         self.trials = tuple(trials)
+        self.without = {**self._unknown(), **type(self).without}
         self._plants: dict[tuple[str, ...], tuple[Plant, Controller, dict[str, float]]] = {}
         self._signals: OrderedDict[tuple[Any, ...], dict[str, Array]] = OrderedDict()
         self._came_back = True
@@ -195,6 +198,17 @@ class PlantRig:
     def __reduce__(self) -> tuple[Any, ...]:
         # A class from a user's file cannot be imported by name in another process.
         return (_rebuild, (self.source or type(self), self.trials))
+
+    def _unknown(self) -> dict[str, str]:
+        """Effects that need a figure of a machine which is not the hand, and which its adapter does not give."""
+        if not (self.sizes or self.linear):
+            return {}
+        return {
+            name: f"the adapter's `known` does not say '{name}.{p.name}' ({p.description})"
+            for name, kind in catalogue().items()
+            for p in kind.known
+            if f"{name}.{p.name}" not in self.known
+        }
 
     @property
     def finest(self) -> float:
@@ -232,7 +246,8 @@ class PlantRig:
             if str(entry["unit"]) != "s":
                 raise HannesError(f"{self.population}: '{name}' is a time in s, not in {entry['unit']!r}.")
             return Nuisance(name, 0.0, sd, False, scatter, "s")
-        unit, mean = model.parameters[name].unit, model.parameters.value(name)
+        own = model.named(name)
+        unit, mean = own.unit, own.value
         if relative and sd <= NARROW and mean > 0.0:
             return Nuisance(name, mean, sd * mean, False, scatter * mean, unit, lower=LEAST * mean)
         return Nuisance(name, mean, sd, relative, scatter, unit)
@@ -245,8 +260,8 @@ class PlantRig:
         """See Rig."""
         if catalogue().get(kind.name) is not kind:
             return kind
-        sizes = tuple(sorted(self.sizes.items()))
-        return scaled_effect(kind, sizes, self.linear)  # type: ignore[arg-type]  # a class is hashable
+        sizes, known = tuple(sorted(self.sizes.items())), tuple(sorted(self.known.items()))
+        return scaled_effect(kind, sizes, self.linear, known)  # type: ignore[arg-type]  # a class is hashable
 
     def comes_back(self, model: Model, trial: Trial) -> float:
         """Part of the reference's span within which a closure ends where the one before it did, if all repeat it.
@@ -476,9 +491,17 @@ def linear_unit(unit: str) -> str:
 
 
 @lru_cache(maxsize=512)
-def scaled_effect(kind: EffectType, sizes: tuple[tuple[str, float], ...], linear: bool) -> EffectType:
-    """The effect with bounds, typical values and starts scaled by dimension to a machine of other sizes."""
-    if not sizes and not linear:
+def scaled_effect(
+    kind: EffectType,
+    sizes: tuple[tuple[str, float], ...],
+    linear: bool,
+    known: tuple[tuple[str, float], ...] = (),
+) -> EffectType:
+    """The effect with bounds, typical values and starts scaled by dimension to a machine of other sizes.
+
+    known  the machine's figures by effect.name
+    """
+    if not sizes and not linear and not known:
         return kind
     parameters = []
     for p in kind.parameters:
@@ -496,6 +519,14 @@ def scaled_effect(kind: EffectType, sizes: tuple[tuple[str, float], ...], linear
             )
         )
     made: EffectType = type(
-        kind.__name__, (kind,), {"parameters": tuple(parameters), "__doc__": kind.__doc__}
+        kind.__name__,
+        (kind,),
+        {
+            "parameters": tuple(parameters),
+            "known": tuple(
+                replace(p, typical=dict(known).get(f"{kind.name}.{p.name}", p.typical)) for p in kind.known
+            ),
+            "__doc__": kind.__doc__,
+        },
     )
     return made

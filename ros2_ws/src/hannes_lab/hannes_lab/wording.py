@@ -48,7 +48,8 @@ def summary(
     far = _moved_far(best)
     if verdict == "nothing":
         explained = (
-            f"the model's misfit {best.fit.cost:.0f} is below what chance reaches ({limits.misfit:.0f})"
+            f"the model's misfit {best.fit.cost:.0f} is {'below' if best.fit.cost < limits.misfit else 'about'} what "
+            f"chance reaches ({limits.misfit:.0f})"
             if choice.adequate
             else f"the model's error on conditions that were left out is {falls[-1].held_out_conditions:.2f} times the "
             "repeatability"

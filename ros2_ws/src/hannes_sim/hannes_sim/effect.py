@@ -88,6 +88,7 @@ class Effect:
     name        identifier in model files and on the command line
     title       what people read
     parameters  the effect's parameters; at least one has a vanishing value
+    known       figures of the machine, which no search moves (`typical` is that of the hand); they follow in p
     states      number of own states (float64, zero at reset)
     memory      True where the effect remembers earlier closures (temperature, say), so that every closure of a
                 recording has to be simulated in turn
@@ -102,6 +103,7 @@ class Effect:
     name: ClassVar[str] = ""
     title: ClassVar[str] = ""
     parameters: ClassVar[tuple[EffectParameter, ...]] = ()
+    known: ClassVar[tuple[EffectParameter, ...]] = ()
     states: ClassVar[int] = 0
     memory: ClassVar[bool] = False
     looks_like: ClassVar[str] = ""
@@ -115,6 +117,11 @@ class Effect:
     def strength(cls) -> EffectParameter:
         """The first parameter that has a vanishing value: at that value the effect is off."""
         return next(p for p in cls.parameters if p.vanishing is not None)
+
+    @classmethod
+    def figures(cls) -> tuple[EffectParameter, ...]:
+        """All that `contribute` finds in p, in this order."""
+        return (*cls.parameters, *cls.known)
 
     @classmethod
     def entry(
@@ -131,14 +138,14 @@ class Effect:
         `intervals` (confidence intervals) become the entry's bounds, otherwise the effect's own bounds do.
         """
         values = dict(values or {})
-        unknown = sorted(set(values) - {p.name for p in cls.parameters})
+        unknown = sorted(set(values) - {p.name for p in cls.figures()})
         if unknown:
             raise HannesError(
                 f"Effect '{cls.name}' has no parameter {', '.join(unknown)}; "
-                f"valid are {', '.join(p.name for p in cls.parameters)}."
+                f"valid are {', '.join(p.name for p in cls.figures())}."
             )
         entries = {}
-        for p in cls.parameters:
+        for p in cls.figures():
             value = float(values.get(p.name, p.typical))
             if not p.lower <= value <= p.upper:
                 raise HannesError(
@@ -161,6 +168,12 @@ def check_effect(effect: EffectType, where: str) -> EffectType:
     if all(p.vanishing is None for p in effect.parameters):
         raise HannesError(
             f"{where}: effect '{effect.name}' needs a parameter with a `vanishing` value (off)."
+        )
+    names = [p.name for p in effect.figures()]
+    if any(p.vanishing is not None for p in effect.known) or len(set(names)) < len(names):
+        raise HannesError(
+            f"{where}: effect '{effect.name}': each parameter needs a name of its own, and what is `known` no "
+            "`vanishing` value."
         )
     if "contribute" not in effect.__dict__ and all(
         "contribute" not in b.__dict__ for b in effect.__mro__[:-2]
@@ -290,9 +303,9 @@ class BoundEffects:
 
     def __init__(self, effects: tuple[tuple[EffectType, Mapping[str, float]], ...]) -> None:
         self.effects = tuple(effect for effect, _ in effects)
-        self.index = {(effect.name, p.name): 0 for effect in self.effects for p in effect.parameters}
+        self.index = {(effect.name, p.name): 0 for effect in self.effects for p in effect.figures()}
         self._functions = [compile_effect(effect) for effect in self.effects]  # type: ignore[arg-type]  # a class is hashable
-        n_parameters = sum(len(effect.parameters) for effect in self.effects)
+        n_parameters = len(self.index)
         self.parameters: NDArray[np.float64] = np.zeros(max(1, n_parameters))
         self.states: NDArray[np.float64] = np.zeros(max(1, sum(effect.states for effect in self.effects)))
         self.table: NDArray[np.int64] = np.zeros(1 + 3 * len(self.effects), dtype=np.int64)
@@ -302,10 +315,10 @@ class BoundEffects:
             self.table[1 + 3 * k] = self._functions[k].address
             self.table[2 + 3 * k] = self.parameters.ctypes.data + 8 * at_p
             self.table[3 + 3 * k] = self.states.ctypes.data + 8 * at_s
-            for j, p in enumerate(effect.parameters):
+            for j, p in enumerate(effect.figures()):
                 self.index[(effect.name, p.name)] = at_p + j
                 self.parameters[at_p + j] = values.get(p.name, p.typical)
-            at_p += len(effect.parameters)
+            at_p += len(effect.figures())
             at_s += effect.states
 
     def set(self, effect: str, parameter: str, value: float) -> None:
@@ -329,7 +342,7 @@ def evaluate(
         x[index] = value
     y = np.zeros(N_OUTPUTS)
     s = np.zeros(max(1, effect.states)) if states is None else states
-    effect.contribute(x, np.array([values.get(p.name, p.typical) for p in effect.parameters]), s, y)
+    effect.contribute(x, np.array([values.get(p.name, p.typical) for p in effect.figures()]), s, y)
     return y
 
 

@@ -6,7 +6,8 @@
 
 return(ql) = preload + stiffness ql; the object is a spring and damper that pushes back only.  Dry friction (it sticks
 exactly) and the damping of hand and object are solved implicitly, the rest semi-implicitly.  A wire of zero stiffness
-switches the load side off: a single mass with a motor, which is what many single-drive machines are.  Where it is known
+switches the load side off: a single mass with a motor, which is what many single-drive machines are; its load is what
+weighs on it.  Where it is known
 that the encoder never reads less than some value of an open hand (`encoder.lowest`), the motor side stops there.
 
 Limits: no single fingers, no gravity along the motion, constant moment arms; the MuJoCo plant has these.
@@ -152,8 +153,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
                     vl = against
             ql += dt * vl
         else:
-            ql, vl, load = q, v, 0.0
-            torque += y[LOAD_TORQUE]
+            ql, vl, load = q, v, -y[LOAD_TORQUE]
 
         inertia = p[P_INERTIA] + y[INERTIA]
         damped = inertia + dt * (p[_VISCOUS] + y[DAMPING])
