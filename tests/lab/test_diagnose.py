@@ -21,6 +21,7 @@ from hannes_lab.hide import DEFAULT_CONDITIONS, Truth, make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.search import Candidate, Search
 from hannes_lab.trials import make_trial
+from hannes_lab.wording import bent_sentence
 from hannes_sim.effect import load_effect, strength_of
 
 CLOSURES = 8
@@ -211,6 +212,37 @@ def test_where_the_model_has_an_error_of_its_own_an_effect_must_lower_the_error(
     assert without_idle(known, rises) == (known, rises), "there the likelihood decides"
     strict = replace(own_error, limits=replace(limits, misfit=0.9 * one.fit.cost))
     assert without_idle(strict, rises)[0].best is both, "the rest would not explain all"
+
+
+def test_effects_that_bend_the_model_and_leave_most_of_the_error_are_no_answer() -> None:
+    """What a set explains with a machine far outside its tolerances must be foretold too."""
+
+    def fall(held_out: float, conditions: float | None = None) -> Fall:
+        return Fall("", held_out, held_out, {}, (), {}, held_out if conditions is None else conditions)
+
+    prepared, _ = data(["glove_stiffness"], seed=102)
+    names = effect_sources(only=["glove_stiffness"])
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, names)
+    one = search.fitted(("glove_stiffness",))
+    limits = chance(search.problem, one.fit, search.signatures(one))
+    about = replace(search, problem=replace(prepared.problem, discrepancy=(OWN_ERROR,)))
+    off = next(k for k, c in enumerate(one.fit.coordinates) if c.name == "friction.viscous")
+    z = one.fit.z.copy()
+    z[off] = -4.0
+    bent = Candidate(one.names, replace(one.fit, z=z), one.penalised)
+    begin = (fall(9.0), fall(4.5))
+    little, enough = (*begin, fall(3.5)), (*begin, fall(2.7))
+    said = bent_sentence(Choice(about, bent, limits, True, ()), little)
+    assert "glove_stiffness would explain it only with friction.viscous" in said and "more than half" in said
+    for choice, falls in (
+        (Choice(about, bent, limits, True, ()), enough),
+        (Choice(about, bent, limits, True, ()), (*begin, fall(3.5, 2.0))),
+        (Choice(about, one, limits, True, ()), little),
+        (Choice(search, bent, limits, True, ()), little),
+        (Choice(about, search.null(), limits, True, ()), begin),
+        (Choice(about, bent, limits, True, ()), (fall(9.0), fall(math.nan), fall(math.nan))),
+    ):
+        assert bent_sentence(choice, falls) == ""
 
 
 def test_where_the_model_has_an_error_of_its_own_more_ties() -> None:

@@ -36,7 +36,7 @@ from .fit import Fit
 from .prepare import Prepared
 from .screen import usable_effects
 from .search import FAR, Candidate, Progress, Search, key_of, silent
-from .wording import idle_sentence, notes, summary
+from .wording import bent_sentence, idle_sentence, notes, summary
 
 Array = NDArray[np.float64]
 
@@ -121,6 +121,8 @@ def diagnose(
             prepared = replace(prepared, problem=choice.search.problem)
             falls = error_falls(prepared, choice.search, choice.best)
     search, best, limits = choice.search, choice.best, choice.limits
+    bent = bent_sentence(choice, falls) if answered and not greedy else ""
+    answered = answered and not bent
     if not answered:
         best, falls = worth_showing(search, best, falls)
     verdict = "unknown" if not answered else "effects" if best.names else "nothing"
@@ -139,7 +141,7 @@ def diagnose(
     )
     return Diagnosis(
         verdict=verdict,
-        summary=summary(search, verdict, effects, tied, falls, limits, choice, best),
+        summary=summary(search, verdict, effects, tied, falls, limits, choice, best, bent),
         effects=effects,
         tied=tied,
         experiments=experiments,

@@ -513,7 +513,9 @@ class Search:
             (base, name, [s for _, s in starts])
             for k, ((base, name), starts) in enumerate(order)
             if (
-                self._promising(k, starts[0][0], least, worth) or (k == 0 and not base.names)
+                self._promising(k, starts[0][0], least, worth)
+                or (k == 0 and not base.names)
+                or (k < REFIT and base.pulled)
                 if self.slow
                 else k < REFIT or base.pulled
             )
@@ -572,7 +574,11 @@ class Search:
         ]
         # The best goes first, to the end: what it reaches tells which others are hopeless.
         done = self.each(Search._settled, [(*item, worth) for item in items[:1]], f"{text}: refit")
-        followed = [(*item, worth, False, False) for item in self._followed(items, done)]
+        followed = [
+            # From a base that is far off the way is long, and where it has gone two moves says little.
+            (*item, worth, False, item[0].pulled and bool(item[0].names) and k < POLISH - 1)
+            for k, item in enumerate(self._followed(items, done))
+        ]
         return done, self.each(Search._settled, followed, f"{text}: refit")
 
     def _followed(self, items: Sequence[_Approached], done: Sequence[Candidate]) -> list[_Approached]:
@@ -581,8 +587,10 @@ class Search:
             return []
         least = done[0].fit.cost
         gains = [base.fit.cost - fits[0].cost for base, _, _, fits in items]
-        # Where it explains all, others can only tie with it: they move the data alike, and so do their approaches.
-        asked = ALIKE * gains[0] if least <= self.problem.features.size else -np.inf
+        # Where it explains all, others can only tie with it: they move the data alike, and so do their approaches.  Not
+        # where it takes a machine far off for that.
+        whole = least <= self.problem.features.size and not done[0].far_off
+        asked = ALIKE * gains[0] if whole else -np.inf
         return [
             item
             for item, gain in zip(items[1:], gains[1:], strict=True)

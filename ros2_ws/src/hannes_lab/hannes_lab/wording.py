@@ -8,7 +8,7 @@ import numpy as np
 
 from .adequacy import shortfall
 from .chance import Chance
-from .choose import Choice, needed_gain
+from .choose import HALF, Choice, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
@@ -42,8 +42,12 @@ def summary(
     limits: Chance,
     choice: Choice,
     best: Candidate,
+    bent: str = "",
 ) -> str:
-    """The verdict in a sentence or two: what is missing, how the error falls, and what to be careful with."""
+    """The verdict in a sentence or two: what is missing, how the error falls, and what to be careful with.
+
+    bent  why the set that chance explains is no answer, if it is none
+    """
     fall = fall_sentence(falls)
     far = _moved_far(best)
     if verdict == "nothing":
@@ -72,8 +76,27 @@ def summary(
             tie = f" With these data it ties with: {others}."
         return f"Missing: {names}. {fall}{tie}{far}"
     part = f" The catalogue comes nearest with {names}, which is not enough." if names else ""
-    why = shortfall(search, best, limits)
-    return f"Something is missing that is not in the catalogue: the best model's {why}.{part} {fall}"
+    why = bent or f"the best model's {shortfall(search, best, limits)}"
+    return f"Something is missing that is not in the catalogue: {why}.{part} {fall}"
+
+
+def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
+    """Why a set of effects that leaves no more than chance and the model's own error is no answer; empty if it is one.
+
+    Where it takes a machine far outside its tolerances as well, and the error on what took no part in the fit does not
+    fall to half of what it is above the repeatability, the effects only help to bend the model.
+    """
+    best, before, after = choice.best, falls[1], falls[-1]
+    if not (best.names and best.far_off and choice.search.problem.discrepancy):
+        return ""
+    pairs = ((before.held_out, after.held_out), (before.held_out_conditions, after.held_out_conditions))
+    known = [(a, b) for a, b in pairs if np.isfinite([a, b]).all()]
+    if not known or any(b - 1.0 <= HALF * (a - 1.0) for a, b in known):
+        return ""
+    return (
+        f"{' and '.join(best.names)} would explain it only with {_far_values(best)}, far outside the tolerance, and "
+        f"still leave more than half of the error on held-out closures"
+    )
 
 
 def notes(
@@ -123,16 +146,21 @@ def nearest_sentence(choice: Choice) -> str:
 
 def _moved_far(best: Candidate) -> str:
     """A sentence on nominal parameters far from their values: this machine's, or an effect of the same form."""
-    far = [
-        f"{c.name} {best.fit.values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g}"
-        for c, off in best.fit.off
-        if off > FAR
-    ]
+    far = _far_values(best)
     if not far:
         return ""
     return (
-        f" But it takes {', '.join(far)}, far outside the tolerance: is the nominal model that of this machine, or is "
+        f" But it takes {far}, far outside the tolerance: is the nominal model that of this machine, or is "
         "there an effect of the same form?"
+    )
+
+
+def _far_values(best: Candidate) -> str:
+    """The nominal parameters that are far from their values, with what they would be."""
+    return ", ".join(
+        f"{c.name} {best.fit.values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g}"
+        for c, off in best.fit.off
+        if off > FAR
     )
 
 
