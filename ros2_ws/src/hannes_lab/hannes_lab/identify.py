@@ -17,13 +17,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
 import numpy as np
 from hannes_description.errors import HannesError
-from hannes_description.model import EffectEntry, Model
-from hannes_description.parameters import Parameter, data_path, read_yaml
+from hannes_description.model import Model
+from hannes_description.parameters import data_path, read_yaml
 from numpy.typing import NDArray
 
 from .fit import Fit, finite_differences, fit
@@ -139,10 +139,9 @@ def free_coordinates(
     if twice:
         raise HannesError(f"--free names {', '.join(twice)} twice.")
     table = read_yaml(data_path("parameters", "population.yaml"), "population file")
-    own = {f"{e.name}.{n}": p for e in model.effects for n, p in e.parameters.items()}
     out = []
     for name in names:
-        p = own[name] if name in own else model.parameters[name]
+        p = model.named(name)
         log = p.lower >= 0.0 and p.value > 0.0
         sd = (sds or {}).get(name)
         if sd is None:
@@ -348,21 +347,12 @@ def warnings_of(parameters: Sequence[Identified], free_count: int, data_count: i
 
 def calibrated_model(model: Model, parameters: Sequence[Identified], source: str) -> Model:
     """The model with the identified values, their intervals as bounds' comment in the source, status identified."""
-    values = {p.name: p for p in parameters}
-
-    def entry(p: Parameter, found: Identified) -> Parameter:
-        interval = f"95 % {found.low:.4g} .. {found.high:.4g}"
-        doubt = "" if found.identified else "; not identified alone"
-        return p.at(found.value, status="identified", source=f"{source}; {interval}{doubt}")
-
-    changed = {n: entry(p, values[n]) for n, p in model.parameters.items() if n in values}
-    out = replace(
-        model, parameters=replace(model.parameters, entries={**model.parameters.entries, **changed}, _hash=[])
-    )
-    for e in model.effects:
-        own = {
-            n: entry(p, values[f"{e.name}.{n}"]) if f"{e.name}.{n}" in values else p
-            for n, p in e.parameters.items()
-        }
-        out = out.with_effect(EffectEntry(e.name, own, e.source))
+    out = model
+    for p in parameters:
+        if p.name in model.names:
+            interval = f"95 % {p.low:.4g} .. {p.high:.4g}"
+            doubt = "" if p.identified else "; not identified alone"
+            out = out.with_values(
+                {p.name: p.value}, status="identified", source=f"{source}; {interval}{doubt}"
+            )
     return out
