@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -54,7 +55,7 @@ gravity.sine: {sd: 0.05, closure_sd: 0.0, unit: "1", source: "the arm's weight a
 LAW = "from lab.test_pendulum import Law\n"
 
 
-def control(x, p, s):  # type: ignore[no-untyped-def]
+def control(x: Any, p: Any, s: Any) -> Any:
     return p[0] * (x[C_REFERENCE] - x[C_POSITION]) - p[1] * x[C_VELOCITY]
 
 

@@ -84,31 +84,32 @@ class Model:
         self, values: Mapping[str, float], *, status: str | None = None, source: str | None = None
     ) -> Model:
         """Other values of named parameters (dotted names), of the model or of its effects."""
-        effects = []
-        for effect in self.effects:
-            names = {f"{effect.name}.{n}": n for n in effect.parameters}
-            own = {
-                names[name]: self.named(name).at(value, status=status, source=source)
-                for name, value in values.items()
-                if name in names
-            }
-            values = {name: value for name, value in values.items() if name not in names}
-            effects.append(replace(effect, parameters={**effect.parameters, **own}) if own else effect)
-        parameters = self.parameters.with_values(values, status=status, source=source)
-        return replace(self, parameters=parameters, effects=tuple(effects))
+
+        def changed(name: str, p: Parameter) -> Parameter:
+            return p.at(values[name], status=status, source=source) if name in values else p
+
+        effects = tuple(
+            replace(e, parameters={n: changed(f"{e.name}.{n}", p) for n, p in e.parameters.items()})
+            for e in self.effects
+        )
+        theirs = self._of_effects
+        own = {name: value for name, value in values.items() if name not in theirs}
+        parameters = self.parameters.with_values(own, status=status, source=source)
+        return replace(self, parameters=parameters, effects=effects)
 
     def named(self, name: str) -> Parameter:
         """A parameter by its dotted name: one of an effect of the model, or one of its own."""
-        kind, _, own = name.partition(".")
-        for effect in self.effects:
-            if effect.name == kind and own in effect.parameters:
-                return effect.parameters[own]
-        return self.parameters[name]
+        own = self._of_effects.get(name)
+        return self.parameters[name] if own is None else own
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Dotted names of all parameters, those of the effects last."""
-        return (*self.parameters, *(f"{e.name}.{n}" for e in self.effects for n in e.parameters))
+    def names(self) -> frozenset[str]:
+        """Dotted names of all parameters, of the model and of its effects."""
+        return frozenset((*self.parameters, *self._of_effects))
+
+    @property
+    def _of_effects(self) -> dict[str, Parameter]:
+        return {f"{e.name}.{n}": p for e in self.effects for n, p in e.parameters.items()}
 
     def with_effect(self, entry: EffectEntry) -> Model:
         """Add an effect, or replace the one of the same name."""

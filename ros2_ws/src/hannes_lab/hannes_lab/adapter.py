@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
+from typing import Any
 
 import numpy as np
 from hannes_description.errors import HannesError
@@ -51,8 +52,7 @@ def check_rig(rig: Rig, model: Model) -> list[str]:
         return []
     who, sizes = type(rig).__name__, dict(rig.sizes)
     for token, size in sizes.items():
-        number = isinstance(size, int | float | np.number) and not isinstance(size, bool)
-        if token not in REFERENCE_SIZES or not (number and 0.0 < float(size) < math.inf):
+        if token not in REFERENCE_SIZES or not (_finite(size) and size > 0.0):
             raise HannesError(
                 f"{who}.sizes: '{token}': {size!r}; it takes positive numbers for {', '.join(REFERENCE_SIZES)} (on a "
                 "linear machine too, where they count as N and m)."
@@ -64,8 +64,7 @@ def check_rig(rig: Rig, model: Model) -> list[str]:
         raise HannesError(f"{who}.without names '{unknown}', which is no effect of the catalogue{meant}")
     figures = [f"{name}.{p.name}" for name, kind in catalogue().items() for p in kind.known]
     for name, value in rig.known.items():
-        number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-        if name not in figures or not (number and math.isfinite(value)):
+        if name not in figures or not _finite(value):
             raise HannesError(f"{who}.known: '{name}': {value!r}; it takes numbers for {', '.join(figures)}.")
     notes = []
     if not sizes:
@@ -79,6 +78,12 @@ def check_rig(rig: Rig, model: Model) -> list[str]:
             given = model.parameters[name].unit
             notes.append(f"{name} is given in '{given}' and taken as {hand[name].unit}: is that what it is?")
     return notes
+
+
+def _finite(value: Any) -> bool:
+    """Whether a value is a number that is one."""
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return number and math.isfinite(value)
 
 
 def check_trials(found: object, rig: str) -> list[Trial]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .trials import RESTS, Closure, Trial
+from .trials import RESTS, Closure, Trial, curves_of, in_words
 
 BLOCK_REST = 0.3
 """s for which the hand rests before a block of closures that is taken as a recording of its own."""
@@ -22,9 +22,6 @@ SEEN = 0.05
 
 CLOSE = 3.0
 """The two closures before it, and the two after it, differ by this factor less."""
-
-PHASES = 60
-"""Places of a closure at which it is compared with the next one."""
 
 
 def told_apart(trial: Trial) -> Trial:
@@ -40,7 +37,9 @@ def told_apart(trial: Trial) -> Trial:
         return trial
     blocks.sort(key=lambda block: block[0].start)
     named = [[replace(c, condition=f"{trial.name}.{k}") for c in block] for k, block in enumerate(blocks, 1)]
-    told = ", ".join(f"{b[0].condition} ({len(b)} closures from {max(b[0].start, 0.0):.1f} s)" for b in named)
+    told = ", ".join(
+        f"{b[0].condition} ({in_words(len(b))} from {max(b[0].start, 0.0):.1f} s)" for b in named
+    )
     note = (
         f"the reference is the same, but the hand does something else from a closure on, so they are {len(blocks)} "
         f"conditions: {told}; --object NAME=soft says what was grasped in one of them"
@@ -54,11 +53,9 @@ def _alike(trial: Trial, closures: Sequence[Closure]) -> list[Sequence[Closure]]
     n = len(closures)
     if n < 4:
         return [closures]
-    length = min(c.stop - c.start for c in closures)
-    phase = np.linspace(0.02 * length, 0.95 * length, PHASES)
     jumps: set[int] = set()
     for time, values in trial.signals.values():
-        curves = np.array([np.interp(c.start + phase, time, values) for c in closures])
+        curves = curves_of(closures, time, values)
         away = np.sqrt(((curves[:, None] - curves[None]) ** 2).mean(axis=2))
         usual = float(np.median(np.diagonal(away, 1)))
         least = max(JUMP * usual, SEEN * float(np.ptp(curves)))

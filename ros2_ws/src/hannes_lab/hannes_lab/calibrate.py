@@ -217,7 +217,7 @@ def _check_names(prepared: Prepared, free: Sequence[str]) -> None:
         settable |= set(plant.names)
     if prepared.model.controller == "double_pid":
         settable |= set(GAINS)
-    known = settable & set(prepared.model.names)
+    known = settable & prepared.model.names
     unknown = [n for n in free if n not in known]
     if unknown:
         close = [m for n in unknown for m in get_close_matches(n, sorted(known), 2)]

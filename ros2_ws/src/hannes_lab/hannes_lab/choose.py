@@ -170,7 +170,7 @@ def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects
     notes = list(grown.notes)
     first, last = grown.errors[0], grown.errors[-1]
     repeats = last <= AS_IT_REPEATS
-    enough = repeats or (bool(grown.best.names) and last - 1.0 <= HALF * (first - 1.0))
+    enough = repeats or (bool(grown.best.names) and halved(first, last))
     if enough and not adequate and not repeats:
         notes.append(
             f"the {shortfall(search, grown.best, limits)}: something smaller is left that the "
@@ -182,6 +182,11 @@ def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects
             "repeatability; less than half would be an answer"
         )
     return Choice(search, grown.best, limits, adequate, ranking, grown.rivals, tuple(notes), enough)
+
+
+def halved(first: float, last: float) -> bool:
+    """Whether an error in multiples of the repeatability, as far as it is above that, falls to HALF."""
+    return last - 1.0 <= HALF * (first - 1.0)
 
 
 def _hard(choice: Choice, first: Candidate) -> bool:

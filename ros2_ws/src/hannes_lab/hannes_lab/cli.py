@@ -464,10 +464,11 @@ def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> 
     for signal in signals:
         table.add_column(f"{signal.replace('_', chr(10), 1)}, {units.get(signal, '')}", justify="right")
     for k, fall in enumerate(found.falls):
-        conditions = ", ".join(f"{c} {_number(v, 3)}" for c, v in fall.by_condition.items())
         if len(fall.by_condition) > _LISTED:
             worst = max(fall.by_condition, key=fall.by_condition.__getitem__)
             conditions = f"at most {_number(fall.by_condition[worst], 3)}, {worst}"
+        else:
+            conditions = ", ".join(f"{c} {_number(v, 3)}" for c, v in fall.by_condition.items())
         if len(fall.by_condition) > 1:
             conditions = f"{_number(fall.held_out_conditions, 3)} ({conditions})"
         table.add_row(

@@ -267,8 +267,8 @@ def _foretells(falls: Sequence[Fall]) -> bool:
 
 def fitted_model(model: Model, search: Search, best: Candidate, limits: Chance) -> Model:
     """The model with fitted nuisance parameters and effects, as it goes into a file."""
-    values = best.fit.values
-    known = {n: v for n, v in values.items() if "@" not in n and n in model.names}
+    values, names = best.fit.values, model.names
+    known = {n: v for n, v in values.items() if "@" not in n and n in names}
     out = model.with_values(known, status="identified", source=FITTED)
     intervals = intervals_of(best.fit, limits)
     for name in best.names:

@@ -347,9 +347,9 @@ def warnings_of(parameters: Sequence[Identified], free_count: int, data_count: i
 
 def calibrated_model(model: Model, parameters: Sequence[Identified], source: str) -> Model:
     """The model with the identified values, their intervals as bounds' comment in the source, status identified."""
-    out = model
+    out, names = model, model.names
     for p in parameters:
-        if p.name in model.names:
+        if p.name in names:
             interval = f"95 % {p.low:.4g} .. {p.high:.4g}"
             doubt = "" if p.identified else "; not identified alone"
             out = out.with_values(

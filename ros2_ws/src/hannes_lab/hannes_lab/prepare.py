@@ -26,7 +26,7 @@ from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig, check_parameters
 from .settle import settle
 from .surrogate import rig_for
-from .trials import SIGNALS, Closure, NoClosure, Trial, compared, stem_of, trial_of, unique_names
+from .trials import SIGNALS, Closure, NoClosure, Trial, compared, curves_of, stem_of, trial_of, unique_names
 from .units import in_si
 
 OUTLIER = 6.0
@@ -144,9 +144,7 @@ def without_outliers(trial: Trial) -> Trial:
             continue
         distance = np.zeros(len(closures))
         for time, values in trial.signals.values():
-            length = min(c.stop - c.start for c in closures)
-            grid = np.linspace(0.02 * length, 0.95 * length, 60)
-            curves = np.array([np.interp(c.start + grid, time, values) for c in closures])
+            curves = curves_of(closures, time, values)
             away = np.sqrt(((curves - np.median(curves, axis=0)) ** 2).mean(axis=1))
             distance = np.maximum(
                 distance, away / max(float(np.median(away)), 1e-3 * float(np.ptp(curves)), 1e-12)

@@ -512,13 +512,7 @@ class Search:
         chosen = [
             (base, name, [s for _, s in starts])
             for k, ((base, name), starts) in enumerate(order)
-            if (
-                self._promising(k, starts[0][0], least, worth)
-                or (k == 0 and not base.names)
-                or (k < REFIT and base.pulled)
-                if self.slow
-                else k < REFIT or base.pulled
-            )
+            if self._worth_an_approach(k, base, starts[0][0], least, worth)
         ]
         ended, others = self._refits(chosen, text, worth)
         fitted = [self._known(c) for c in (*ended, *others)]
@@ -597,10 +591,17 @@ class Search:
             if gain >= asked and item[3][0].cost <= max(HOPELESS * least, (1.0 - REMOVED) * item[0].fit.cost)
         ]
 
-    @staticmethod
-    def _promising(rank: int, scanned: float, least: float, worth: float) -> bool:
-        """Whether a refit on a slow plant can be worth its time: by its rank, and by what the scan says of it."""
-        return rank < REFIT and scanned < worth and scanned <= HOPELESS * least
+    def _worth_an_approach(
+        self, rank: int, base: Candidate, scanned: float, least: float, worth: float
+    ) -> bool:
+        """Whether an extension is fitted: by its rank in the scan and, on a slow plant, by what the scan says of it.
+
+        Of a base that is far off a scan says little.
+        """
+        if not self.slow:
+            return rank < REFIT or base.pulled
+        promising = base.pulled or (scanned < worth and scanned <= HOPELESS * least)
+        return (rank < REFIT and promising) or (rank == 0 and not base.names)
 
     def each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
         """function(search, *item) for every item, wherever the executor works; the same results everywhere.

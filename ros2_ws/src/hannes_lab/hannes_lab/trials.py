@@ -63,6 +63,9 @@ SAME = 5e-4
 MOST_SHIFT = 15
 """Ticks by which a closure may begin earlier or later than where its reference was seen to move."""
 
+PHASES = 60
+"""Places at which closures are compared with one another."""
+
 EARLY = 0.1
 """s that a closure may begin before its recording: the reference stands there."""
 
@@ -489,10 +492,10 @@ def trial_of(recording: Recording, *, name: str | None = None, period: float = 1
     closures = group_closures(reference, period, whole, name, channel.period)
     cut = len(spans) - len(closures) - (len(inside) - len(whole))
     if cut:
-        notes.append(f"{cut} of {_closures(len(spans))} {'is' if cut == 1 else 'are'} cut off and left out")
+        notes.append(f"{cut} of {in_words(len(spans))} {'is' if cut == 1 else 'are'} cut off and left out")
     kinds = Counter(closure.condition for closure in closures)
     if len(kinds) > 1:
-        told = ", ".join(f"{kind} ({_closures(count)})" for kind, count in kinds.items())
+        told = ", ".join(f"{kind} ({in_words(count)})" for kind, count in kinds.items())
         notes.append(
             f"the references of its closures differ, so they are {len(kinds)} conditions: {told}; a closure that was "
             "broken off is one of its own; --object NAME=soft says what was grasped in one of them"
@@ -511,13 +514,21 @@ def trial_of(recording: Recording, *, name: str | None = None, period: float = 1
     )
 
 
-def _closures(count: int) -> str:
+def in_words(count: int) -> str:
+    """How many closures there are."""
     return f"{count} closure{'s' * (count != 1)}"
 
 
 def left_out(count: int) -> str:
     """The note about closures with a gap in a signal."""
-    return f"{_closures(count)} in which samples are missing {'is' if count == 1 else 'are'} left out"
+    return f"{in_words(count)} in which samples are missing {'is' if count == 1 else 'are'} left out"
+
+
+def curves_of(closures: Sequence[Closure], time: Array, values: Array) -> Array:
+    """A signal over each closure, at PHASES places of the shortest one: (closures, PHASES)."""
+    length = min(c.stop - c.start for c in closures)
+    phase = np.linspace(0.02 * length, 0.95 * length, PHASES)
+    return np.array([np.interp(c.start + phase, time, values) for c in closures])
 
 
 def has_gap(time: Array, start: float, stop: float) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 
 from .adequacy import shortfall
 from .chance import Chance
-from .choose import HALF, Choice, needed_gain
+from .choose import Choice, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
@@ -91,11 +91,11 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
         return ""
     pairs = ((before.held_out, after.held_out), (before.held_out_conditions, after.held_out_conditions))
     known = [(a, b) for a, b in pairs if np.isfinite([a, b]).all()]
-    if not known or any(b - 1.0 <= HALF * (a - 1.0) for a, b in known):
+    if not known or any(halved(a, b) for a, b in known):
         return ""
     return (
         f"{' and '.join(best.names)} would explain it only with {_far_values(best)}, far outside the tolerance, and "
-        f"still leave more than half of the error on held-out closures"
+        "still leave more than half of the error on held-out closures"
     )
 
 
