@@ -77,6 +77,28 @@ def test_moves_are_the_stretches_between_standstills() -> None:
     assert [round(b - a, 1) for a, b in spans[:4]] == [0.4, 0.5, 0.6, 0.4]
 
 
+def test_moves_after_stands_of_other_lengths_begin_alike() -> None:
+    u = np.linspace(0.0, 1.0, 1000)
+    up = 0.6 * (u - np.sin(2 * np.pi * u) / (2 * np.pi))
+    stands = [np.full(n, 0.6 * (k % 2)) for k, n in enumerate((300, 1200, 1000, 1500, 4000))]
+    ways = [up, up[::-1], up, up[::-1], np.zeros(0)]
+    path = np.concatenate([part for pair in zip(stands, ways, strict=True) for part in pair])
+    spans = find_moves(path, 1e-3)
+    assert len(spans) == 4
+    leaves = np.cumsum([0.3, 2.2, 2.0, 2.5])
+    assert [a for a, _ in spans] == pytest.approx(list(leaves - 0.3), abs=0.005)
+    assert [b - a for a, b in spans] == pytest.approx([2.2, 2.0, 2.5, 2.2], abs=0.005)
+
+
+@pytest.mark.parametrize("digits", [5, 4, 3])
+def test_moves_of_a_reference_of_few_digits(digits: int) -> None:
+    exact = find_moves(reference(2), 1e-3)
+    path = reference(2)
+    rounded = find_moves(np.round(path / np.ptp(path), digits), 1e-3)
+    assert len(rounded) == len(exact)
+    assert np.array(rounded) == pytest.approx(np.array(exact), abs=0.03)
+
+
 def test_effects_without_a_meaning_are_not_offered(prepared: Prepared) -> None:
     usable = usable_effects(prepared, effect_sources(model=prepared.model))
     assert {"coulomb_friction", "cogging", "presliding_friction"} <= set(usable.sources)

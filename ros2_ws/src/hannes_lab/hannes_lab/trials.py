@@ -66,6 +66,11 @@ MOST_SHIFT = 15
 PHASES = 60
 """Places at which closures are compared with one another."""
 
+MOVING = 2.0
+DIGIT = 0.25
+"""A move between two stands is so many times faster than they are somewhere; and speeds are taken over so many samples
+that one last digit of the reference makes this part of a stand's limit: written with few digits it moves in steps."""
+
 EARLY = 0.1
 """s that a closure may begin before its recording: the reference stands there."""
 
@@ -373,13 +378,49 @@ def _since(rest: Array, level: float) -> int:
 def find_moves(reference: Array, period: float, *, slow: float = 0.1) -> list[tuple[float, float]]:
     """Start and stop [s] of every stretch between two moments at which the reference (nearly) stands.
 
-    Such a moment is the slowest sample of a run whose speed is below `slow` times the greatest speed.  For machines
-    that move on from place to place instead of coming back to rest; stretches cut off at the ends are left out.
+    A stand is a run whose speed is below `slow` times the greatest speed, and between two of them it goes twice as fast
+    at least.  A move begins where its stand does; after a longer stand than the shortest one it begins that much before
+    the reference sets off, so that moves which repeat each other begin alike.  For machines that move on from place to
+    place instead of coming back to rest; stretches cut off at the ends are left out.
     """
-    speed = np.abs(np.gradient(reference, period))
-    stands = speed < slow * float(speed.max())
-    turns = [first + int(np.argmin(speed[first : last + 1])) for first, last in _runs(stands)]
-    return [(a * period, b * period) for a, b in itertools.pairwise(turns) if b - a >= 3]
+    speed = _speed(reference, period, slow)
+    limit = slow * float(speed.max())
+    stands: list[tuple[int, int]] = []
+    for first, last in _runs(speed < limit):
+        if stands and speed[stands[-1][1] : first].max() < MOVING * limit:
+            first = stands.pop()[0]
+        stands.append((first, last))
+    still = [_stillest(speed[first : last + 1], first) for first, last in stands]
+    if len(still) < 2:
+        return []
+    # The last stand begins no move, and may be of any length.
+    shortest = min(last - first for first, last in still[:-1])
+    begins = [last - shortest for _, last in still]
+    # What of a stand belongs to the move before it; after the last move there may be more.
+    after = [last - shortest - first for first, last in still[1:-1]] or [0]
+    begins[-1] = min(begins[-1], still[-1][0] + round(float(np.median(after))))
+    return [(a * period, b * period) for a, b in itertools.pairwise(begins) if b - a >= 3]
+
+
+def _speed(reference: Array, period: float, slow: float) -> Array:
+    """Speed (n,) of a reference, over as many samples as one written with few digits needs."""
+    steps = np.abs(np.diff(reference))
+    greatest = float(np.abs(np.gradient(reference, period)).max())
+    digit = float(steps[steps > 0.0].min()) if steps.any() else 0.0
+    half = max(1, math.ceil(digit / (DIGIT * slow * greatest * period) / 2)) if greatest > 0.0 else 1
+    index = np.arange(reference.size)
+    before, after = np.maximum(index - half, 0), np.minimum(index + half, reference.size - 1)
+    return np.asarray(np.abs(reference[after] - reference[before]) / ((after - before) * period))
+
+
+def _stillest(speed: Array, offset: int) -> tuple[int, int]:
+    """First and last index of the longest run of a stand (n,) in which the reference does not move at all.
+
+    Of a turn without a rest, its slowest moment.
+    """
+    slowest = int(np.argmin(speed))
+    longest = max(_runs(speed <= speed[slowest]), key=lambda run: run[1] - run[0])
+    return longest[0] + offset, longest[1] + offset
 
 
 def group_closures(
