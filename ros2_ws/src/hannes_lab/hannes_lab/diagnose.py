@@ -205,6 +205,8 @@ def _named_instead(null: Candidate, choice: Choice, search: Search) -> tuple[Can
         return null, choice
     other = search.with_nuisances([n for n in search.nuisances if n.effect not in same])
     bare, names = other.null(), (*best.names, *same)
+    if is_adequate(other, other.from_point(best.names, best.fit.point), choice.limits):
+        return null, choice
     _, coordinates = other.with_effects(names)
     start = dict(best.fit.point)
     for effect, values in same.items():
