@@ -110,7 +110,8 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
         round_ = [c for c in round_ if not distorted(choice.search, c)] or round_
         if enough and round_[0].penalised < worth and set(choice.best.names) < set(round_[0].names):
             # The set without it may find its way further down from there; what is left is the gain.
-            choice = replace(choice, best=choice.search.without(round_[0], choice.best.names))
+            (base,) = choice.search.without(round_[0], [choice.best.names])
+            choice = replace(choice, best=base)
         # What chance gains was found for effects of one free strength; further parameters pay their penalty.
         gains = [choice.best.penalised + PENALTY - c.penalised for c in round_]
         needed = [needed_gain(choice, choice.best, c, first=first_one) for c in round_]
@@ -233,10 +234,8 @@ def pruned(choice: Choice) -> Choice:
     """Without what a later effect made superfluous: sets grow one by one, and an early one may be a stopgap."""
     while choice.adequate and len(choice.best.names) > 1:
         best = choice.best
-        parts = [
-            choice.search.without(best, tuple(n for n in best.names if n != name)) for name in best.names
-        ]
-        part = min(parts, key=lambda c: c.penalised)
+        parts = [tuple(n for n in best.names if n != name) for name in best.names]
+        part = min(choice.search.without(best, parts), key=lambda c: c.penalised)
         gain = part.penalised + PENALTY - best.penalised
         if gain >= needed_gain(choice, part, best) or not is_adequate(choice.search, part, choice.limits):
             break

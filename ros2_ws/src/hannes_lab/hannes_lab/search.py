@@ -95,7 +95,8 @@ DISTINCT = 3.0
 deviations on two ends of a fit are not the same: an effect may be in reach from one of them only."""
 
 RIVAL_START = 2.0
-"""A second start of a fit is carried on if it costs less than so many times what the first reached."""
+"""A second start of a fit is carried on if it costs less than so many times what the first reached; so is, on a slow
+plant, another set."""
 
 HOPELESS = 10.0
 """Sets whose cost is so many times that of the best are not followed; on a slow plant, by the scan already."""
@@ -325,10 +326,12 @@ class Search:
 
         whole   on a slow plant, carry them on to the end
         """
-        best = self._carried_on(approaches[0], worth, short, whole)
+        first = best = self._carried_on(approaches[0], worth, short, whole)
         for other in approaches[1:]:
             if other.cost <= RIVAL_START * (approaches[0] if short else best).cost:
-                best = min(best, self._carried_on(other, worth, short, whole), key=lambda f: f.cost)
+                best = min(best, self._carried_on(other, worth, short, whole=False), key=lambda f: f.cost)
+        if whole and best is not first:
+            best = min(best, self._carried_on(best, worth), key=lambda f: f.cost)
         if best.cost > base.fit.cost:
             # The set contains the base: the search was led astray, and starts again from where the base is.
             strengths = {f"{name}.{p.name}" for p in self.effect(name).parameters if p.vanishing is not None}
@@ -459,22 +462,33 @@ class Search:
         """A candidate of another problem (other noise), fitted in this one from its point."""
         return _candidate(candidate.names, self._led_back(self._again(candidate.fit, evaluations)))
 
-    def without(self, larger: Candidate, names: Names) -> Candidate:
-        """A part of a set, fitted again from where the larger one ended, or its known fit if that costs less."""
+    def without(self, larger: Candidate, parts: Sequence[Names]) -> list[Candidate]:
+        """Parts of a set, each fitted again from where the larger one ended, or its known fit if that costs less."""
+        todo = [(Candidate(names, self._part(larger.fit, names), np.inf), 15) for names in parts]
+        again = self.each(Search._refit, todo, "without it")
+        return [self._better_known(one) for one in again]
+
+    def _better_known(self, candidate: Candidate) -> Candidate:
+        known = self.found.get(candidate.key)
+        return known if known is not None and known.fit.cost <= candidate.fit.cost else self._known(candidate)
+
+    def _part(self, larger: Fit, names: Names) -> Fit:
+        """Where a fit of a larger set ended, without the other effects."""
         model, coordinates = self.with_effects(names)
-        index = [[c.name for c in larger.fit.coordinates].index(c.name) for c in coordinates]
-        z, jacobian = larger.fit.z[index], larger.fit.jacobian[:, index]
-        there = replace(larger.fit, model=model, coordinates=coordinates, z=z, jacobian=jacobian)
-        again: Candidate = self.once(Search._refit, Candidate(names, there, np.inf), 15, text="without it")
-        known = self.found.get(key_of(names))
-        return known if known is not None and known.fit.cost <= again.fit.cost else self._known(again)
+        index = [[c.name for c in larger.coordinates].index(c.name) for c in coordinates]
+        z, jacobian = larger.z[index], larger.jacobian[:, index]
+        return replace(larger, model=model, coordinates=coordinates, z=z, jacobian=jacobian)
 
     def fitted(self, names: Names) -> Candidate:
         """The fit of a set: the known one, or one effect after the other."""
         found = self.null()
         for k, name in enumerate(names):
             known = self.found.get(key_of(names[: k + 1]))
-            found = known or self.polish(self.add(found, name))
+            if known is None:
+                known = self.add(found, name)
+                # On a slow plant it was carried to its end.
+                known = known if self.slow else self.polish(known)
+            found = known
         return found
 
     def refitted(self, candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -522,7 +536,7 @@ class Search:
         done |= {c.key for c in ended}
         ranked = sorted(best, key=lambda c: c.penalised)
         # On a slow plant polishing is long, and the best are polished already.
-        most = min(worth, HOPELESS * ranked[0].penalised) if self.slow and ranked else worth
+        most = min(worth, RIVAL_START * ranked[0].penalised) if self.slow and ranked else worth
         worthy = [c for c in ranked[:POLISH] if c.penalised < most and c.key not in done]
         ranked = self._polished(ranked, worthy, text)
         if not self.slow and ranked and (ranked[0].far_off or ranked[0].penalised >= worth):
@@ -547,7 +561,7 @@ class Search:
     ) -> tuple[list[Candidate], list[Candidate]]:
         """Fits in closed loop: all are approached, and those that this does not leave hopeless are carried on.
 
-        Those of a slow plant that were carried on to the end, and the others.
+        Those of a slow plant that were carried to the end, and the others.
         """
         short = not self.slow and len(chosen) > REFIT
         found = self.each(Search._approaches, [(*item, worth, short) for item in chosen], f"{text}: approach")
@@ -566,29 +580,38 @@ class Search:
             for item in items
             if not item[0].names or _candidate(item[0].names, item[3][0]).penalised < item[0].penalised
         ]
-        # The best goes first, to the end: what it reaches tells which others are hopeless.
-        done = self.each(Search._settled, [(*item, worth) for item in items[:1]], f"{text}: refit")
-        followed = [
-            # From a base that is far off the way is long, and where it has gone two moves says little.
-            (*item, worth, False, item[0].pulled and bool(item[0].names) and k < POLISH - 1)
-            for k, item in enumerate(self._followed(items, done))
-        ]
-        return done, self.each(Search._settled, followed, f"{text}: refit")
+        # The best goes first, to the end: what it reaches tells which others are hopeless.  From a base that is far off
+        # the way is long, and where it has gone two moves says little: there two more go to the end.
+        ended = self._to_the_end(items[:1], text, worth)
+        rest = self._followed(items, ended, items[1:])
+        further = list(itertools.takewhile(_from_far_off, rest[: POLISH - 1]))
+        ended += self._to_the_end(further, text, worth)
+        rest = self._followed(items, ended, rest[len(further) :])
+        return ended, self.each(
+            Search._settled, [(*item, worth, False, False) for item in rest], f"{text}: refit"
+        )
 
-    def _followed(self, items: Sequence[_Approached], done: Sequence[Candidate]) -> list[_Approached]:
-        """Which approaches to a slow plant are carried on after the first one, by what that reached."""
-        if not done:
+    def _to_the_end(self, items: Sequence[_Approached], text: str, worth: float) -> list[Candidate]:
+        return self.each(Search._settled, [(*item, worth) for item in items], f"{text}: refit")
+
+    def _followed(
+        self, items: Sequence[_Approached], ended: Sequence[Candidate], rest: Sequence[_Approached]
+    ) -> list[_Approached]:
+        """Which other approaches to a slow plant are carried on, by what those reached that were carried to the end."""
+        if not ended:
             return []
-        least = done[0].fit.cost
-        gains = [base.fit.cost - fits[0].cost for base, _, _, fits in items]
+        best = min(ended, key=lambda c: c.fit.cost)
+        least = best.fit.cost
+        led = next(item for item in items if key_of((*item[0].names, item[1])) == best.key)
         # Where it explains all, others can only tie with it: they move the data alike, and so do their approaches.  Not
         # where it takes a machine far off for that.
-        whole = least <= self.problem.features.size and not done[0].far_off
-        asked = ALIKE * gains[0] if whole else -np.inf
+        whole = least <= self.problem.features.size and not best.far_off
+        asked = ALIKE * _gain(led) if whole else -np.inf
         return [
             item
-            for item, gain in zip(items[1:], gains[1:], strict=True)
-            if gain >= asked and item[3][0].cost <= max(HOPELESS * least, (1.0 - REMOVED) * item[0].fit.cost)
+            for item in rest
+            if _gain(item) >= asked
+            and item[3][0].cost <= max(HOPELESS * least, (1.0 - REMOVED) * item[0].fit.cost)
         ]
 
     def _worth_an_approach(
@@ -726,6 +749,17 @@ def _work(
     counts.simulations = counts.failures = 0
     result = function(search, *item)
     return result, counts.simulations, counts.failures
+
+
+def _from_far_off(item: _Approached) -> bool:
+    """True of an approach from a set of effects that is far off."""
+    return bool(item[0].names) and item[0].pulled
+
+
+def _gain(item: _Approached) -> float:
+    """By how much an approach lowered its base's cost."""
+    base, _, _, fits = item
+    return base.fit.cost - fits[0].cost
 
 
 def _candidate(names: Names, found: Fit) -> Candidate:
