@@ -114,6 +114,9 @@ PULLED = 4.0
 """Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are approached: it may
 have taken over an effect, which a scan does not see."""
 
+STEPS = (2.0, 0.5)
+"""Other lengths of the steps of a refit's derivatives, in multiples of the usual ones."""
+
 POLISH = 3
 """Extensions of a round that are refitted with all derivatives afresh."""
 
@@ -389,22 +392,33 @@ class Search:
         return candidate
 
     def _again(self, old: Fit, evaluations: int) -> Fit:
-        """A fit from where another ended; on a slow plant with its slopes there, as those of elsewhere mislead."""
+        """A fit from where another ended; on a slow plant with its slopes there, as those of elsewhere mislead.
+
+        Dry friction makes the misfit rough: a fit stays where derivatives over steps of one length promise nothing, and
+        goes on with those over longer or shorter ones.
+        """
         if self.slow:
             return settle(self.problem, old, self.rows, afresh=True)[1]
+        found = self._over_steps(old, evaluations, 1.0)
+        for length in STEPS:
+            found = min(found, self._over_steps(found, evaluations, length), key=lambda f: f.cost)
+        return found
+
+    def _over_steps(self, old: Fit, evaluations: int, length: float) -> Fit:
+        """A fit from where another ended, its first derivatives over so many times the usual steps."""
         return fit(
             self.problem,
             old.model,
             old.coordinates,
             old.z,
             rows=self.rows,
-            steps=spread(old),
+            steps={name: length * step for name, step in spread(old).items()},
             evaluations=evaluations,
         )
 
     def _led_back(self, found: Fit) -> Fit:
         """A fit with parameters that are far off held at their nominal values and all else fitted again, where that
-        costs less; a slow plant's stays as it is.
+        costs less; a slow plant's stays as it is.  Those of a recording alone may lie across the way too.
 
         Parameters that only act together (an efficiency, and the mass and friction that it drives) are told by their
         priors alone.  While much is unexplained, a fit stays where that of a worse model had gone: what is bent or
@@ -412,7 +426,7 @@ class Search:
         """
         tried: set[str] = set()
         while not self.slow:
-            far = [c for c, off in found.off if off > PULLED and not c.wide and "@" not in c.name]
+            far = [c for c, off in found.off if off > PULLED]
             held = next((c for c in far if c.name not in tried), None)
             if held is None:
                 break
@@ -538,19 +552,19 @@ class Search:
         # On a slow plant polishing is long, and the best are polished already.
         most = min(worth, RIVAL_START * ranked[0].penalised) if self.slow and ranked else worth
         worthy = [c for c in ranked[:POLISH] if c.penalised < most and c.key not in done]
-        ranked = self._polished(ranked, worthy, text)
+        ranked = self.polished(ranked, worthy, text)
         if not self.slow and ranked and (ranked[0].far_off or ranked[0].penalised >= worth):
             done |= {c.key for c in worthy}
             rest = [c for c in ranked[:REFIT] if c.far_off and c.key not in done]
             bent = [c for c in rest if self._led_astray(todo[c.key][0])]
-            ranked = self._polished(ranked, bent, text)
+            ranked = self.polished(ranked, bent, text)
         return ranked
 
     def _led_astray(self, base: Candidate) -> bool:
         """True where a base leaves little and is far off: what it takes over fits nearly as well as an effect would."""
         return base.far_off and base.fit.cost <= self.problem.features.size
 
-    def _polished(self, ranked: Sequence[Candidate], some: Sequence[Candidate], text: str) -> list[Candidate]:
+    def polished(self, ranked: Sequence[Candidate], some: Sequence[Candidate], text: str) -> list[Candidate]:
         """The candidates, of which some are fitted with all derivatives afresh; sorted by penalised cost."""
         polished = self.each(Search._polish, [(c,) for c in some], f"{text}: polish")
         better = {c.names: self._known(c) for c in polished}
