@@ -28,7 +28,7 @@ DISTORTED, WAVES = 2.5, 3.0
 """Standard deviations, root of the sum of the squares, that the shapes of a periodic effect may be off from what is
 usual of them where fewer than so many of its waves fit into the travel: bent further it stands for a curve that does
 not repeat.  Waves that repeat may have any form: of the ripple of EMPS, 98 waves, the third harmonic is as large as the
-first."""
+first.  Where not even one wave fits in, nothing repeats at all."""
 
 
 def is_adequate(search: Search, candidate: Candidate, limits: Chance, room: float = ADEQUATE) -> bool:
@@ -83,7 +83,7 @@ def _travel(trial: Trial) -> float:
 
 
 def distorted(search: Search, candidate: Candidate) -> str:
-    """The effect of few waves whose shapes are farther off than DISTORTED, in words; empty if none is."""
+    """The effect of less than one wave, or of few whose shapes are farther off than DISTORTED, in words; or empty."""
     fit = candidate.fit
     for effect in candidate.names:
         kind = search.effect(effect)
@@ -95,6 +95,10 @@ def distorted(search: Search, candidate: Candidate) -> str:
         }
         travel = max(_travel(trial) for trial in search.problem.features.trials)
         waves = travel / fit.values[f"{effect}.{period.name}"]
+        if waves < 1.0:
+            return (
+                f"{effect}, of {waves:.1f} waves in all, would repeat nowhere: it stands for something else"
+            )
         if waves < WAVES and math.hypot(*shapes.values()) > DISTORTED:
             name = max(shapes, key=lambda n: abs(shapes[n]))
             return (
