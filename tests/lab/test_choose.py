@@ -27,10 +27,21 @@ class Made:
     It has of Search what `choose` calls, and no more.
     """
 
-    problem, slow, sources = SimpleNamespace(discrepancy=True), False, ("a", "b")
+    problem: Any = SimpleNamespace(
+        discrepancy=True,
+        features=SimpleNamespace(conditions=("slow", "fast"), blocks=(SimpleNamespace(n=5),)),
+    )
+    slow, sources = False, ("a", "b")
 
     def __init__(self, *found: Candidate) -> None:
         self.found = {c.key: c for c in found}
+        self.held_out: dict[tuple[str, ...], float] = {}
+
+    def each(self, function: Any, items: Sequence[tuple[Candidate]], text: str) -> list[float]:
+        return [self.held_out[candidate.names] for (candidate,) in items]
+
+    def polished(self, ranked: Sequence[Candidate], some: Sequence[Candidate], text: str) -> list[Candidate]:
+        return list(ranked)
 
     def renewed(self, best: Candidate) -> "Made":
         return self
@@ -44,8 +55,8 @@ class Made:
     def signatures(self, base: Candidate) -> dict[str, list[Any]]:
         return {}
 
-    def without(self, larger: Candidate, names: tuple[str, ...]) -> Candidate:
-        return NULL
+    def without(self, larger: Candidate, parts: Sequence[tuple[str, ...]]) -> list[Candidate]:
+        return [self.found[part] for part in parts]
 
 
 def search_of(*found: Candidate) -> Any:
@@ -73,14 +84,46 @@ def test_what_leads_back_joins_though_another_fits_better(given: pytest.MonkeyPa
     """The other gains 8 % where OWN_ERROR_PART is asked of it: it is neither the answer nor a tie."""
     assert np.isclose(OWN_ERROR_PART, 0.12)
     given.setattr(module, "_extended", lambda choice, front, *rest: [MORE, BACK] if front == [NULL] else [])
-    choice = choose(search_of(MORE, BACK), NULL, LIMITS, 2)
+    choice = choose(search_of(NULL, MORE, BACK), NULL, LIMITS, 2)
     assert choice.best.names == ("b",) and choice.rivals == ()
     assert [rank.names for rank in choice.ranking] == [("b",), ("a",)]
 
 
+@pytest.mark.parametrize(
+    ("gain", "before", "after", "joins"),
+    [
+        (0.10, 4.0, 2.5, True),
+        (0.10, 4.0, 3.0, False),
+        (0.03, 4.0, 2.5, False),
+        (0.10, 1.2, 1.0, False),
+    ],
+    ids=["halves", "does not", "chance", "as it repeats"],
+)
+def test_a_small_second_effect_joins_where_it_halves_what_was_left_out(
+    given: pytest.MonkeyPatch, gain: float, before: float, after: float, joins: bool
+) -> None:
+    """It gains less than OWN_ERROR_PART: the error on conditions that were left out decides."""
+    one = made(("a",), 700.0, 1.0)
+    two = made(("a", "b"), (1.0 - gain) * 700.0, 1.0)
+    given.setattr(module, "_extended", lambda choice, front, *rest: [one] if front == [NULL] else [two])
+    search = search_of(NULL, one, made(("b",), 990.0, 1.0), two)
+    search.held_out = {one.names: before, two.names: after}
+    choice = choose(search, NULL, LIMITS, 2)
+    assert choice.best is (two if joins else one)
+
+
+def test_the_form_of_another_machine_is_no_effect(given: pytest.MonkeyPatch) -> None:
+    """What a first effect gains must be twice what chance does, where the model has an error of its own."""
+    small = made((), 100.0, 1.0)
+    for gain, names in ((30.0, ()), (50.0, ("a",))):
+        first = made(("a",), 100.0 - gain, 1.0)
+        given.setattr(module, "_extended", lambda *a, first=first: [first])
+        assert choose(search_of(small, first), small, LIMITS, 1).best.names == names
+
+
 def test_what_was_asked_of_the_nearest_effect_is_said(given: pytest.MonkeyPatch) -> None:
     given.setattr(module, "_extended", lambda choice, front, *rest: [MORE])
-    choice = choose(search_of(MORE), NULL, LIMITS, 1)
+    choice = choose(search_of(NULL, MORE), NULL, LIMITS, 1)
     assert choice.best.names == ()
     assert np.isclose(MORE.fit.cost, 920.0)
     assert "lowers the misfit by 80, and 120 are asked for" in nearest_sentence(choice)

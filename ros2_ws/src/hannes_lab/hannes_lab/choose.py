@@ -12,7 +12,7 @@ from .adequacy import distorted, is_adequate, leads_back, shortfall
 from .chance import Chance, chance
 from .diagnosis import Rank
 from .features import Features
-from .greedy import AS_IT_REPEATS, grow
+from .greedy import AS_IT_REPEATS, JUDGED, grow, held_out_error
 from .search import HOPELESS, PENALTY, Candidate, Search, key_of
 
 WORTHWHILE = 0.05
@@ -26,6 +26,10 @@ OWN_ERROR_PART = 0.12
 """The same where the model has an error of its own, also within chance: its width is assumed, and it is not noise.
 There a second effect must remove FURTHER times as much.  Not so one that leads back what is far off without it: the
 hand's own parameters had taken it over, and what is left of it is small."""
+
+OWN_ERROR_CHANCE = 2.0
+"""Where the model has an error of its own, how many times what chance gains an effect must gain: that error is the form
+of another machine, which repeats, and the curves of an effect may follow it."""
 
 TIE = 6.0
 """Sets whose penalised costs differ by less cannot be told apart: a likelihood ratio of e^3 = 20.  The best is the
@@ -116,6 +120,11 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
         gains = [choice.best.penalised + PENALTY - c.penalised for c in round_]
         needed = [needed_gain(choice, choice.best, c, first=first_one) for c in round_]
         joins = next((k for k, gain in enumerate(gains) if gain >= needed[k]), None)
+        if joins is None and not first_one and _may_halve(choice, choice.best, round_[0]):
+            # A small gain is not polished by itself, and what it foretells depends on where the fit has come.
+            better = choice.search.polished(round_, round_[:JUDGED], text)
+            if _halves(choice, choice.best, better[0]):
+                joins, round_ = 0, better
         # Those that fit better, but gain less than is asked of them, are no rivals of the first that joins.
         short = round_[: joins or 0]
         round_ = [c for c in round_ if c not in short]
@@ -223,11 +232,31 @@ def needed_gain(
     """
     limits = choice.limits
     enough = is_adequate(choice.search, base, limits, room=1.0)
+    further = FURTHER if enough and not first else 1.0
     if choice.search.problem.discrepancy:
-        part = 0.0 if leads_back(base, extended) else OWN_ERROR_PART
-    else:
-        part = 0.0 if enough else WORTHWHILE
-    return max(limits.gain, part * base.fit.cost) * (FURTHER if enough and not first else 1.0)
+        part = 0.0 if leads_back(base, extended) else OWN_ERROR_PART * further
+        return max(OWN_ERROR_CHANCE * limits.gain, part * base.fit.cost)
+    return max(limits.gain, 0.0 if enough else WORTHWHILE * base.fit.cost) * further
+
+
+def _may_halve(choice: Choice, base: Candidate, extended: Candidate) -> bool:
+    """Whether effects gain more than chance, and the error on held-out conditions can tell what more they are."""
+    search = choice.search
+    gain = base.penalised + PENALTY - extended.penalised
+    fast = not search.slow and can_be_held_out(search.problem.features)
+    return fast and bool(search.problem.discrepancy) and gain >= OWN_ERROR_CHANCE * choice.limits.gain
+
+
+def _halves(choice: Choice, base: Candidate, extended: Candidate) -> bool:
+    """Whether effects halve the held-out error where the model's own error has room for what a base leaves.
+
+    That error's width is assumed; where effects foretell what took no part in the fit so much better, it was wide for
+    this machine, and what they gain is not its form.  What halves is the mean square above the repeatability's.
+    """
+    if not _may_halve(choice, base, extended):
+        return False
+    before, after = choice.search.each(held_out_error, [(base,), (extended,)], "held-out conditions")
+    return before > AS_IT_REPEATS and after**2 - 1.0 <= HALF * (before**2 - 1.0)
 
 
 def pruned(choice: Choice) -> Choice:
@@ -238,6 +267,8 @@ def pruned(choice: Choice) -> Choice:
         part = min(choice.search.without(best, parts), key=lambda c: c.penalised)
         gain = part.penalised + PENALTY - best.penalised
         if gain >= needed_gain(choice, part, best) or not is_adequate(choice.search, part, choice.limits):
+            break
+        if _halves(choice, part, best):
             break
         choice = cut_to(choice, part)
     return choice
