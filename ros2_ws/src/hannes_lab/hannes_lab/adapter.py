@@ -262,7 +262,8 @@ def _check_repeats(trial: Trial, where: str) -> None:
                 raise HannesError(
                     f"{where}: the closures at {first.start:.6g} and {other.start:.6g} s are both '{condition}', but "
                     f"their references are {apart:.3g} apart in the mean and go over {span:.3g}: they do not repeat "
-                    "one another. Give each move, and each direction, a condition of its own."
+                    "one another. Give each move, and each direction, a condition of its own, and let repeats begin at "
+                    "the same moment of it."
                 )
 
 
