@@ -28,7 +28,7 @@ DISTORTED, WAVES = 2.5, 3.0
 """Standard deviations, root of the sum of the squares, that the shapes of a periodic effect may be off from what is
 usual of them where fewer than so many of its waves fit into the travel: bent further it stands for a curve that does
 not repeat.  Waves that repeat may have any form: of the ripple of EMPS, 98 waves, the third harmonic is as large as the
-first.  Where not even one wave fits in, nothing repeats at all."""
+first.  Where not even one wave fits in, nothing repeats, and another machine's form is nearer than a ripple."""
 
 
 def is_adequate(search: Search, candidate: Candidate, limits: Chance, room: float = ADEQUATE) -> bool:
@@ -95,7 +95,7 @@ def distorted(search: Search, candidate: Candidate) -> str:
         }
         travel = max(_travel(trial) for trial in search.problem.features.trials)
         waves = travel / fit.values[f"{effect}.{period.name}"]
-        if waves < 1.0:
+        if waves < 1.0 and (search.problem.rig.foreign or search.problem.discrepancy):
             return (
                 f"{effect}, of {waves:.1f} waves in all, would repeat nowhere: it stands for something else"
             )

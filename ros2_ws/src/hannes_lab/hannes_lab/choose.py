@@ -120,8 +120,8 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
         gains = [choice.best.penalised + PENALTY - c.penalised for c in round_]
         needed = [needed_gain(choice, choice.best, c, first=first_one) for c in round_]
         joins = next((k for k, gain in enumerate(gains) if gain >= needed[k]), None)
-        if joins is None and not first_one and _may_halve(choice, choice.best, round_[0]):
-            # A small gain is not polished by itself, and what it foretells depends on where the fit has come.
+        if joins is None and not first_one and _may_halve(choice, choice.best, round_[0], 1.0):
+            # A small gain is not polished by itself, and what it is, and foretells, depends on where the fit has come.
             better = choice.search.polished(round_, round_[:JUDGED], text)
             if _halves(choice, choice.best, better[0]):
                 joins, round_ = 0, better
@@ -239,12 +239,12 @@ def needed_gain(
     return max(limits.gain, 0.0 if enough else WORTHWHILE * base.fit.cost) * further
 
 
-def _may_halve(choice: Choice, base: Candidate, extended: Candidate) -> bool:
-    """Whether effects gain more than chance, and the error on held-out conditions can tell what more they are."""
+def _may_halve(choice: Choice, base: Candidate, extended: Candidate, times: float = OWN_ERROR_CHANCE) -> bool:
+    """Whether effects gain so many times what chance does, and held-out conditions can tell what more they are."""
     search = choice.search
     gain = base.penalised + PENALTY - extended.penalised
     fast = not search.slow and can_be_held_out(search.problem.features)
-    return fast and bool(search.problem.discrepancy) and gain >= OWN_ERROR_CHANCE * choice.limits.gain
+    return fast and bool(search.problem.discrepancy) and gain >= times * choice.limits.gain
 
 
 def _halves(choice: Choice, base: Candidate, extended: Candidate) -> bool:
