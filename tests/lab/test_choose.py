@@ -113,9 +113,9 @@ def test_a_small_second_effect_joins_where_it_halves_what_was_left_out(
 
 
 def test_the_form_of_another_machine_is_no_effect(given: pytest.MonkeyPatch) -> None:
-    """What a first effect gains must be twice what chance does, where the model has an error of its own."""
+    """A first effect must gain half as much again as chance does, where the model has an error of its own."""
     small = made((), 100.0, 1.0)
-    for gain, names in ((30.0, ()), (50.0, ("a",))):
+    for gain, names in ((25.0, ()), (35.0, ("a",))):
         first = made(("a",), 100.0 - gain, 1.0)
         given.setattr(module, "_extended", lambda *a, first=first: [first])
         assert choose(search_of(small, first), small, LIMITS, 1).best.names == names

@@ -27,7 +27,7 @@ OWN_ERROR_PART = 0.12
 There a second effect must remove FURTHER times as much.  Not so one that leads back what is far off without it: the
 hand's own parameters had taken it over, and what is left of it is small."""
 
-OWN_ERROR_CHANCE = 2.0
+OWN_ERROR_CHANCE = 1.5
 """Where the model has an error of its own, how many times what chance gains an effect must gain: that error is the form
 of another machine, which repeats, and the curves of an effect may follow it."""
 
@@ -234,8 +234,8 @@ def needed_gain(
     enough = is_adequate(choice.search, base, limits, room=1.0)
     further = FURTHER if enough and not first else 1.0
     if choice.search.problem.discrepancy:
-        part = 0.0 if leads_back(base, extended) else OWN_ERROR_PART * further
-        return max(OWN_ERROR_CHANCE * limits.gain, part * base.fit.cost)
+        part = 0.0 if leads_back(base, extended) else OWN_ERROR_PART
+        return max(OWN_ERROR_CHANCE * limits.gain, part * base.fit.cost) * further
     return max(limits.gain, 0.0 if enough else WORTHWHILE * base.fit.cost) * further
 
 
