@@ -239,7 +239,9 @@ def needed_gain(
     return max(limits.gain, 0.0 if enough else WORTHWHILE * base.fit.cost) * further
 
 
-def _may_halve(choice: Choice, base: Candidate, extended: Candidate, times: float = OWN_ERROR_CHANCE) -> bool:
+def _may_halve(
+    choice: Choice, base: Candidate, extended: Candidate, times: float = FURTHER * OWN_ERROR_CHANCE
+) -> bool:
     """Whether effects gain so many times what chance does, and held-out conditions can tell what more they are."""
     search = choice.search
     gain = base.penalised + PENALTY - extended.penalised
