@@ -35,8 +35,8 @@ class EncoderEccentricity(Effect):
         ),
     )
     looks_like = (
-        "the tracking error and the current wave slowly with the angle, the same in every closure "
-        "and at every speed"
+        "the current waves weakly and slowly with the angle, the same in every closure and at every speed; "
+        "the loop makes the encoder follow, so that the measured position hardly shows it"
     )
     told_by = "slow closures to full travel; compare with the finger joints"
 
