@@ -206,6 +206,12 @@ def test_where_the_model_has_an_error_of_its_own_an_effect_must_lower_the_error(
     assert (
         nothing.best.names == () and falls == begin[:2] and "3.90 instead of 4.00 on closures" in nothing.idle
     )
+    z = np.zeros(null.fit.z.size)
+    z[[c.name for c in null.fit.coordinates].index("hand.coulomb")] = 7.0
+    about.found[()] = Candidate((), replace(null.fit, z=z, cost=limits.misfit), 0.0)
+    back, falls = without_idle(single, alone)
+    assert back.best is one and falls == alone, "what leads a parameter back stays"
+    assert "glove_stiffness the model foretells as well, but only with hand.coulomb 0.0136" in back.notes[-1]
     unrepeated = (*begin[:2], fall("glove_stiffness", math.nan))
     assert without_idle(single, unrepeated) == (single, unrepeated), "nothing was left out"
     known = Choice(search, both, limits, True, ())
@@ -239,10 +245,39 @@ def test_effects_that_bend_the_model_and_leave_most_of_the_error_are_no_answer()
         (Choice(about, bent, limits, True, ()), (*begin, fall(3.5, 2.0))),
         (Choice(about, one, limits, True, ()), little),
         (Choice(search, bent, limits, True, ()), little),
-        (Choice(about, search.null(), limits, True, ()), begin),
+        (Choice(about, replace(bent, names=()), limits, True, ()), begin),
         (Choice(about, bent, limits, True, ()), (fall(9.0), fall(math.nan), fall(math.nan))),
     ):
         assert bent_sentence(choice, falls) == ""
+
+
+def test_a_model_that_is_bent_in_several_parameters_and_still_errs_is_not_all_there_is() -> None:
+    """Two well-known parameters far off, and twice the repeatability left: "nothing" would be a hand that is none."""
+
+    def falls(error: float, conditions: float) -> tuple[Fall, Fall]:
+        return (Fall("", 9.0, 9.0, {}, (), {}, 9.0), Fall("", error, error, {}, (), {}, conditions))
+
+    prepared, _ = data([], seed=102)
+    names = effect_sources(only=["glove_stiffness"])
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, names)
+    null = search.null()
+    limits = chance(search.problem, null.fit, search.signatures(null))
+    about = replace(search, problem=replace(prepared.problem, discrepancy=(OWN_ERROR,)))
+
+    def bent(*off: str) -> Candidate:
+        z = [5.0 if c.name in off else 0.0 for c in null.fit.coordinates]
+        return Candidate((), replace(null.fit, z=np.array(z)), null.penalised)
+
+    two = bent("hand.stiffness", "friction.coulomb")
+    said = bent_sentence(Choice(about, two, limits, True, ()), falls(2.4, 2.7))
+    assert "hand.stiffness 0.00187" in said and "friction.coulomb" in said and "2.40 times" in said
+    for choice, some in (
+        (Choice(about, two, limits, True, ()), falls(1.9, 2.7)),
+        (Choice(about, two, limits, True, ()), falls(2.4, 1.9)),
+        (Choice(about, bent("friction.coulomb"), limits, True, ()), falls(2.4, 2.7)),
+        (Choice(search, two, limits, True, ()), falls(2.4, 2.7)),
+    ):
+        assert bent_sentence(choice, some) == ""
 
 
 def test_where_the_model_has_an_error_of_its_own_more_ties() -> None:

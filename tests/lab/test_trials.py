@@ -7,6 +7,7 @@ import pytest
 from hannes_bags.recording import Channel, Recording
 from hannes_control.reference import half_sine
 from hannes_description.errors import HannesError
+from hannes_lab.adapter import check_trials
 from hannes_lab.blocks import in_blocks, told_apart
 from hannes_lab.prepare import without_outliers
 from hannes_lab.trials import (
@@ -56,7 +57,9 @@ def test_conditions_one_after_the_other_in_a_bag_are_recordings_of_their_own() -
     one, two = in_blocks(whole)
     assert (one.name, two.name) == ("s.1", "s.2") and (one.notes, two.notes) == (("said",), ())
     assert len(one.closures) == 3 and len(two.closures) == 2
-    assert one.reference.size + two.reference.size == reference.size
+    for part in (one, two):
+        assert part.closures[-1].stop <= part.reference.size * 1e-3
+    check_trials([one, two], "HandRig")
     for part, closure in ((one, closures[1]), (two, closures[4])):
         own = part.closures[1]
         for name in signals:
@@ -97,6 +100,22 @@ def test_closures_on_an_object_are_a_condition_of_their_own_though_the_reference
     assert {name: len(whole.of(name)) for name in whole.conditions} == {"s.1": 5, "s.2": 4, "s.3": 2}
     assert any("s.2 (4 closures from 14.5 s)" in note and "--object" in note for note in whole.notes)
     assert [part.name for part in in_blocks(whole)] == ["s.1", "s.2", "s.3"]
+
+
+def test_a_soft_grasp_is_told_apart_beside_a_firm_one() -> None:
+    """Beside the span that a firm grasp gives the current, what a soft one changes is little."""
+    whole = told_apart(closures_with([8.0] * 5 + [7.4] * 5 + [1.0] * 5))
+    assert [len(whole.of(name)) for name in whole.conditions] == [5, 5, 5]
+
+
+def test_the_last_closure_of_a_block_may_last_until_the_next_block_begins() -> None:
+    """Closures last until the next one sets off; half of the rest before a block belongs to both."""
+    trial = closures_with([8.0] * 4 + [5.0] * 4)
+    long = tuple(replace(c, stop=c.start + 2.8) for c in trial.closures[:-1])
+    whole = told_apart(replace(trial, closures=(*long, trial.closures[-1])))
+    one, two = check_trials(in_blocks(whole), "HandRig")
+    assert len(one.closures) == len(two.closures) == 4
+    assert one.closures[-1].stop == pytest.approx(one.reference.size * 1e-3)
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,13 @@ from .trials import RESTS, Closure, Trial, curves_of, in_words
 BLOCK_REST = 0.3
 """s for which the hand rests before a block of closures that is taken as a recording of its own."""
 
-JUMP = 10.0
+JUMP = 6.0
 """Change of a signal from one closure to the next, over the usual one, from which another condition may begin there
 though the reference is the same: something else is grasped."""
 
 SEEN = 0.05
-"""Part of the signal's span that the change must be, too."""
+"""Part of the signal's span in the closure with less of it that the change must be, too: a firm grasp makes the span
+of all so large that a soft one after nothing is little beside it."""
 
 CLOSE = 3.0
 """The two closures before it, and the two after it, differ by this factor less."""
@@ -58,11 +59,11 @@ def _alike(trial: Trial, closures: Sequence[Closure]) -> list[Sequence[Closure]]
         curves = curves_of(closures, time, values)
         away = np.sqrt(((curves[:, None] - curves[None]) ** 2).mean(axis=2))
         usual = float(np.median(np.diagonal(away, 1)))
-        least = max(JUMP * usual, SEEN * float(np.ptp(curves)))
+        spans = np.ptp(curves, axis=1)
         jumps |= {
             k
             for k in range(2, n - 1)
-            if away[k - 1, k] > least
+            if away[k - 1, k] > max(JUMP * usual, SEEN * spans[k - 1 : k + 1].min())
             and away[k - 2 : k, k : k + 2].min() > CLOSE * max(away[k - 2, k - 1], away[k, k + 1])
         }
     cuts = [0, *sorted(jumps), n]
@@ -89,8 +90,10 @@ def in_blocks(trial: Trial) -> list[Trial]:
             for b, r in zip(blocks[1:], rests[1:], strict=True)
         ),
     ]
+    # The last closure of a block ends where the next block's first one sets off, which is after that one's rest.
+    ends = [*(round(b[0].start / trial.period) for b in blocks[1:]), trial.reference.size]
     parts: list[Trial] = []
-    for block, begin, end in zip(blocks, begins, [*begins[1:], trial.reference.size], strict=True):
+    for block, begin, end in zip(blocks, begins, ends, strict=True):
         origin, stop = begin * trial.period, end * trial.period
         inside = {name: (time >= origin) & (time < stop) for name, (time, _) in trial.signals.items()}
         parts.append(

@@ -13,7 +13,7 @@ from hannes_description.model import EffectEntry, Model
 from hannes_sim.effect import catalogue, effect_source, load_effect
 from numpy.typing import NDArray
 
-from .adequacy import is_adequate
+from .adequacy import is_adequate, leads_back
 from .chance import Chance, chance
 from .choose import (
     MAX_EFFECTS,
@@ -36,7 +36,7 @@ from .fit import Fit
 from .prepare import Prepared
 from .screen import usable_effects
 from .search import FAR, Candidate, Progress, Search, key_of, silent
-from .wording import bent_sentence, idle_sentence, notes, summary
+from .wording import bent_sentence, idle_sentence, led_back_sentence, notes, summary
 
 Array = NDArray[np.float64]
 
@@ -237,7 +237,8 @@ def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple
     """Without the effects that foretell no better what took no part in the fit, where those before them explain all.
 
     Only where the recordings are of another machine than the simulator's: there a better fit alone is no reason for an
-    effect, since the form of the model is wrong anyway.
+    effect, since the form of the model is wrong anyway.  What leads a parameter back into its tolerance stays: the one
+    does what the other did, and foretells the same.
     """
     rig = choice.search.problem.rig
     keep = len(falls) - 2
@@ -248,6 +249,8 @@ def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple
     part = choice.search.found[key_of(fall.added for fall in falls[2 : keep + 2])]
     if not is_adequate(choice.search, part, choice.limits):
         return choice, falls
+    if leads_back(part, choice.best):
+        return replace(choice, notes=(*choice.notes, led_back_sentence(choice.best, part))), falls
     fewer = falls[: keep + 2]
     idle = idle_sentence(choice.best, part, falls[-1], fewer[-1])
     cut = cut_to(choice, part)
