@@ -103,9 +103,7 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
             room = choice.limits.misfit - choice.limits.median
             front, far = [c for c in front if c.penalised <= front[0].penalised + room], []
         first_one = size == 1
-        # Near to a base that explains all, what a scan promises is about what a fit reaches; a slow plant takes long.
-        promised = 1.0 if enough and search.slow and not choice.best.pulled else 0.5
-        worth = choice.best.penalised - promised * needed_gain(choice, choice.best, first=first_one)
+        worth = choice.best.penalised - 0.5 * needed_gain(choice, choice.best, first=first_one)
         text = f"{COUNTS.get(size, size)} effect{'s' * (size > 1)}"
         round_ = _extended(choice, front, far, text, worth)
         if not round_:

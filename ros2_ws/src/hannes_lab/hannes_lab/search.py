@@ -540,7 +540,7 @@ class Search:
         chosen = [
             (base, name, [s for _, s in starts])
             for k, ((base, name), starts) in enumerate(order)
-            if self._worth_an_approach(k, base, starts[0][0], least, worth - self._charged(base, name))
+            if self._worth_an_approach(k, base, starts[0][0], least, worth)
         ]
         ended, others = self._refits(chosen, text, worth)
         fitted = [self._known(c) for c in (*ended, *others)]
@@ -639,10 +639,6 @@ class Search:
             return rank < REFIT or base.pulled
         promising = base.pulled or (scanned < worth and scanned <= HOPELESS * least)
         return (rank < REFIT and promising) or (rank == 0 and not base.names)
-
-    def _charged(self, base: Candidate, name: str) -> float:
-        """What the parameters of a base with one more effect cost."""
-        return _penalty(self.with_effects((*base.names, name))[1])
 
     def each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
         """function(search, *item) for every item, wherever the executor works; the same results everywhere.
