@@ -59,6 +59,8 @@ def test_conditions_one_after_the_other_in_a_bag_are_recordings_of_their_own() -
     assert len(one.closures) == 3 and len(two.closures) == 2
     for part in (one, two):
         assert part.closures[-1].stop <= part.reference.size * 1e-3
+    both = round(two.closures[0].start / 1e-3)
+    assert one.reference.size + two.reference.size == reference.size + both, "up to where the second sets off"
     check_trials([one, two], "HandRig")
     for part, closure in ((one, closures[1]), (two, closures[4])):
         own = part.closures[1]

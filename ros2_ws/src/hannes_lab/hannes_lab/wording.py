@@ -101,11 +101,12 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
         return ""
     if not best.names:
         far = sum(off > FAR and not c.wide for c, off in best.fit.off)
-        if far < BENT or min(b for _, b in known) <= STAYS:
+        least = min(b for _, b in known)
+        if far < BENT or least <= STAYS:
             return ""
         return (
             f"the model as it is would explain it only with {_far_values(best)}, far outside the tolerance, and the "
-            f"error on held-out closures still stays at {known[0][1]:.2f} times the repeatability"
+            f"error on what took no part in the fit still stays at {least:.2f} times the repeatability"
         )
     if any(halved(a, b) for a, b in known):
         return ""
@@ -132,7 +133,6 @@ def notes(
 
 def idle_sentence(whole: Candidate, part: Candidate, with_all: Fall, with_part: Fall) -> str:
     """Why effects of a set that fits better are not named."""
-    more = [name for name in whole.names if name not in part.names]
     pairs = (
         ("closures", with_part.held_out, with_all.held_out),
         ("conditions", with_part.held_out_conditions, with_all.held_out_conditions),
@@ -141,19 +141,23 @@ def idle_sentence(whole: Candidate, part: Candidate, with_all: Fall, with_part: 
         f"{b:.2f} instead of {a:.2f} on {what}" for what, a, b in pairs if np.isfinite([a, b]).all()
     )
     return (
-        f"{' and '.join(more)} would fit better (misfit {whole.fit.cost:.0f} instead of {part.fit.cost:.0f}), but not "
-        f"foretell better what took no part in the fit: an error of {errors} that were left out, in multiples of the "
+        f"{_further(whole, part)} would fit better (misfit {whole.fit.cost:.0f} instead of {part.fit.cost:.0f}), but "
+        f"not foretell better what took no part in the fit: an error of {errors} that were left out, in multiples of the "
         "repeatability"
     )
 
 
 def led_back_sentence(whole: Candidate, part: Candidate) -> str:
     """Why effects are named without which what took no part in the fit is foretold as well."""
-    more = [name for name in whole.names if name not in part.names]
     return (
-        f"without {' and '.join(more)} the model foretells as well, but only with {_far_values(part)}, far outside "
+        f"without {_further(whole, part)} the model foretells as well, but only with {_far_values(part)}, far outside "
         "the tolerance"
     )
+
+
+def _further(whole: Candidate, part: Candidate) -> str:
+    """The effects of a set that a part of it lacks."""
+    return " and ".join(name for name in whole.names if name not in part.names)
 
 
 def nearest_sentence(choice: Choice) -> str:
