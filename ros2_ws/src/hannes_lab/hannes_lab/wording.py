@@ -142,8 +142,8 @@ def idle_sentence(whole: Candidate, part: Candidate, with_all: Fall, with_part: 
     )
     return (
         f"{_further(whole, part)} would fit better (misfit {whole.fit.cost:.0f} instead of {part.fit.cost:.0f}), but "
-        f"not foretell better what took no part in the fit: an error of {errors} that were left out, in multiples of the "
-        "repeatability"
+        f"not foretell better what took no part in the fit: an error of {errors} that were left out, in multiples of "
+        "the repeatability"
     )
 
 
