@@ -24,7 +24,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,6 @@ import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import EffectEntry, Model
 from hannes_lab.diagnose import diagnose, effect_sources
-from hannes_lab.errors import Fixed
 from hannes_lab.fit import fit
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
@@ -183,7 +182,8 @@ def detection_factors(names: list[str], seed: int = 7) -> dict[str, float]:
         with_effect, _ = search.with_effects((kind.name,))
         factor, top = 1e-3, highest_factor(name)
         while factor < top:
-            held = Fixed(prepared.problem, {f"{kind.name}.{n}": v for n, v in strength(name, factor)})
+            strengths = {f"{kind.name}.{n}": v for n, v in strength(name, factor)}
+            held = replace(prepared.problem, held=strengths)
             found = fit(held, with_effect, base.coordinates, base.z, known=known, evaluations=8)
             if found.cost >= base.cost + DETECTABLE:
                 # The way to a parameter that takes all of it over may be longer.

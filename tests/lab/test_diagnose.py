@@ -251,35 +251,6 @@ def test_effects_that_bend_the_model_and_leave_most_of_the_error_are_no_answer()
         assert bent_sentence(choice, falls) == ""
 
 
-def test_a_model_that_is_bent_in_several_parameters_and_still_errs_is_not_all_there_is() -> None:
-    """Two well-known parameters far off, and twice the repeatability left: "nothing" would be a hand that is none."""
-
-    def falls(error: float, conditions: float) -> tuple[Fall, Fall]:
-        return (Fall("", 9.0, 9.0, {}, (), {}, 9.0), Fall("", error, error, {}, (), {}, conditions))
-
-    prepared, _ = data([], seed=102)
-    names = effect_sources(only=["glove_stiffness"])
-    search = Search(prepared.problem, prepared.model, prepared.nuisances, names)
-    null = search.null()
-    limits = chance(search.problem, null.fit, search.signatures(null))
-    about = replace(search, problem=replace(prepared.problem, discrepancy=(OWN_ERROR,)))
-
-    def bent(*off: str) -> Candidate:
-        z = [5.0 if c.name in off else 0.0 for c in null.fit.coordinates]
-        return Candidate((), replace(null.fit, z=np.array(z)), null.penalised)
-
-    two = bent("hand.stiffness", "friction.coulomb")
-    said = bent_sentence(Choice(about, two, limits, True, ()), falls(2.4, 2.7))
-    assert "hand.stiffness 0.00187" in said and "friction.coulomb" in said and "2.40 times" in said
-    for choice, some in (
-        (Choice(about, two, limits, True, ()), falls(1.9, 2.7)),
-        (Choice(about, two, limits, True, ()), falls(2.4, 1.9)),
-        (Choice(about, bent("friction.coulomb"), limits, True, ()), falls(2.4, 2.7)),
-        (Choice(search, two, limits, True, ()), falls(2.4, 2.7)),
-    ):
-        assert bent_sentence(choice, some) == ""
-
-
 def test_where_the_model_has_an_error_of_its_own_more_ties() -> None:
     prepared, _ = data(["glove_stiffness"], seed=102)
     search = Search(prepared.problem, prepared.model, prepared.nuisances, {})

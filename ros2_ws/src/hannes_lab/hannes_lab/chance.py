@@ -50,15 +50,16 @@ def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple
     if not resampled:
         return rng.standard_normal((problem.features.size, draws)), False
     raw = np.empty((problem.features.size, draws))
-    drawn: dict[tuple[str, int], tuple[Array, Array]] = {}
+    drawn: dict[tuple[int, str, int], tuple[Array, Array]] = {}
     for block, rows, deviation in zip(blocks, problem.features.slices, problem.deviations, strict=True):
         n, m = block.n, deviation.shape[0]
-        if (block.condition, n) not in drawn:
+        closures = (block.trial, block.condition, n)
+        if closures not in drawn:
             # A first closure that starts from another state scatters like any other.
             which = np.tile(np.arange(n) - (n - m), (draws, 1))
             which[:, : n - m] = rng.integers(m, size=(draws, n - m))
-            drawn[block.condition, n] = which, rng.choice([-1.0, 1.0], size=(draws, n))
-        which, signs = drawn[block.condition, n]
+            drawn[closures] = which, rng.choice([-1.0, 1.0], size=(draws, n))
+        which, signs = drawn[closures]
         scale = np.sqrt(m / (m - 1.0))
         for k in range(draws):
             raw[rows, k] = block.combine(signs[k][:, None] * deviation[which[k]]) * scale
@@ -74,7 +75,6 @@ def chance(
     *,
     draws: int = 400,
     level: float = 0.98,
-    rows: NDArray[np.bool_] | None = None,
     seed: int = 0,
 ) -> Chance:
     """Critical values at the given level, in the linear approximation around a fit.
@@ -83,10 +83,8 @@ def chance(
     """
     rng = np.random.default_rng(seed)
     noise, resampled = noise_draws(problem, draws, rng)
-    use = np.ones(problem.features.size, dtype=bool) if rows is None else rows
-    noise = noise[use]
     prior = np.array([1.0 if c.prior else 1e-6 for c in null.coordinates])
-    jacobian = np.vstack([null.jacobian[use], np.diag(np.sqrt(prior))])
+    jacobian = np.vstack([null.jacobian, np.diag(np.sqrt(prior))])
     basis, _ = np.linalg.qr(jacobian)
     padded = np.vstack([noise, np.zeros((prior.size, draws))])
     left = padded - basis @ (basis.T @ padded)
@@ -94,7 +92,7 @@ def chance(
     gains = np.zeros(draws)
     for shapes in signatures.values():
         for signature in shapes:
-            d = np.vstack([signature[use], np.zeros((prior.size, signature.shape[1]))])
+            d = np.vstack([signature, np.zeros((prior.size, signature.shape[1]))])
             d = d - basis @ (basis.T @ d)
             keep = np.linalg.norm(d, axis=0) > 1e-9
             if keep.any():

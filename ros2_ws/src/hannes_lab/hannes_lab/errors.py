@@ -158,18 +158,6 @@ def held_out_closures(
     return overall(inside), overall(outside)
 
 
-def held_out_conditions(
-    problem: Problem,
-    model: Model,
-    coordinates: Sequence[Coordinate],
-    start: Array,
-    known: Mapping[str, Array] | None = None,
-) -> dict[str, float]:
-    """Overall error on each condition when it took no part in the fit; see held_out_condition_errors."""
-    errors = held_out_condition_errors(problem, model, coordinates, start, known)
-    return {condition: overall(own) for condition, own in errors.items()}
-
-
 def held_out_condition_errors(
     problem: Problem,
     model: Model,
@@ -179,8 +167,8 @@ def held_out_condition_errors(
 ) -> dict[str, tuple[SignalError, ...]]:
     """Errors on each condition when it took no part in the fit.
 
-    Parameters of the held-out recording alone (its object, its own encoder zero: `name@condition`) cannot be known from
-    the others; they are then fitted on the held-out condition with everything else kept.
+    Parameters of a recording (its object, its own encoder zero: `name@recording`) cannot be known from the others:
+    where no condition is left of it, they are fitted on the held-out one with everything else kept.
 
     known   derivatives (size,) by coordinate name that are taken as constant
     """
@@ -191,31 +179,15 @@ def held_out_condition_errors(
     for condition in features.conditions:
         rows = features.rows(condition)
         found = fit(problem, model, coordinates, start, rows=~rows, known=known, evaluations=6)
-        trial = features.trials[next(b.trial for b in features.blocks if b.condition == condition)].name
-        own = [c for c in coordinates if c.name.endswith(f"@{trial}")]
+        seen = {b.trial for b in features.blocks if b.condition != condition}
+        alone = {trial.name for k, trial in enumerate(features.trials) if k not in seen}
+        own = [c for c in coordinates if c.name.partition("@")[2] in alone]
         values = found.values
         if own:
-            local = Fixed(problem, {n: v for n, v in values.items() if n not in {c.name for c in own}})
+            held = {n: v for n, v in values.items() if n not in {c.name for c in own}}
+            local = replace(problem, held=held)
             values = {**values, **fit(local, model, own, {}, rows=rows, evaluations=6).values}
         rig = anchored_at(problem.rig, model, values)
         errors = signal_errors(features, features.closures(rig, model, values))
         out[condition] = tuple(e for e in errors if e.condition == condition)
     return out
-
-
-class Fixed(Problem):
-    """A problem in which some parameters are held."""
-
-    def __init__(self, problem: Problem, held: Mapping[str, float]) -> None:
-        super().__init__(
-            problem.rig,
-            problem.features,
-            problem.whitener,
-            problem.deviations,
-            problem.counts,
-            problem.discrepancy,
-        )
-        self._held = dict(held)
-
-    def residual(self, model: Model, values: Mapping[str, float]) -> Array:
-        return super().residual(model, {**self._held, **values})

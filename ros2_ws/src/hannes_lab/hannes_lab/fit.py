@@ -204,6 +204,12 @@ OFF_BOUND = 0.02
 be cut short by it."""
 
 
+UNSEEN = 1e-3
+"""Where only a part of the features takes part in a fit: weight with which a strength or a shape without a prior is
+drawn to where it vanishes, or is typical.  Else what that part does not show of it would stay at the start, which may
+have been fitted to the rest."""
+
+
 class Derivatives:
     """Derivatives (size, k) of the whitened residual along the way of a fit.
 
@@ -304,7 +310,7 @@ def fit(
 ) -> Fit:
     """Least squares over z from `start` (z by name, others 0).
 
-    rows         features that take part; None: all
+    rows         features that take part; None: all (see UNSEEN)
     known        derivatives (size,) by coordinate name with which to begin; the others are found by finite differences,
                  see Derivatives
     steps        of the finite differences, see there
@@ -323,7 +329,10 @@ def fit(
     )
     bounds = np.array([c.bounds for c in coordinates]).T if coordinates else np.zeros((2, 0))
     priors = prior_weights(coordinates)
+    edge = np.where(priors > 0.0, OFF_BOUND, 1e-9)
     use = np.ones(problem.features.size, dtype=bool) if rows is None else rows
+    if rows is not None:
+        priors = np.maximum(priors, UNSEEN)
     cache: dict[bytes, Array] = {}
 
     def residual_at(z: Array) -> Array:
@@ -358,7 +367,6 @@ def fit(
     if not coordinates:
         r = problem.residual(model, {})
         return Fit(model, (), np.zeros(0), float(r[use] @ r[use]), r, np.zeros((r.size, 0)))
-    edge = np.where(priors > 0.0, OFF_BOUND, 1e-9)
     inside = np.clip(z0, bounds[0] + edge, bounds[1] - edge)
     z, complete, simulated, samples = inside, True, 0, int(np.count_nonzero(use))
     try:

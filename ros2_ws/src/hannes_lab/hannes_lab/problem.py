@@ -4,7 +4,8 @@ The mean of n closures is uncertain by the noise of the sensors and by the scatt
 moves whole curves, not single samples: it is expressed in the simulator's own parameters (friction, object place,
 encoder zero ...), whose sensitivities are known, so that 13 closures are enough to estimate it.
 
-    C_c = (diag(v) + J_c S J_c^T) / n        per condition c; v smoothed sample variance, S = diag(scatter variances)
+    C_c = (diag(v) + J_c S J_c^T) / n        per recording and condition c; v smoothed sample variance,
+                                             S = diag(scatter variances)
 
 Where the model's form is not exactly that of the machine (a real hand, another simulator) its own error is added, which
 does not average out over the closures: a smooth random curve of the width `rig.own_error` (Kennedy, O'Hagan 2001, with
@@ -31,6 +32,8 @@ from .features import Block, Features, alike
 from .rig import Nuisance, Rig
 
 Array = NDArray[np.float64]
+Part = tuple[NDArray[np.int64], Array]
+"""Rows of the features, and a Cholesky factor of a covariance of them."""
 
 DISCREPANCY_LENGTH = 0.1
 """Part of a closure over which the model's own error stays alike."""
@@ -190,22 +193,29 @@ class Counts:
 class Problem:
     """Data, noise and rig of one data set; counts its simulations.
 
-    whitener    per condition, rows of the features and the Cholesky factor of their covariance
+    whitener    per recording and condition, rows of the features and the Cholesky factor of their covariance; every
+                feature has its place in one of them
     deviations  per block (m, p), scatter of the m closures that start alike: what the model does not predict of their
                 differences
     discrepancy  rows of the features and the Cholesky factor of the covariance of the model's own error, if it has one
+    held        parameters that have these values whatever else is tried
     """
 
     rig: Rig
     features: Features
-    whitener: tuple[tuple[NDArray[np.int64], Array], ...]
+    whitener: tuple[Part, ...]
     deviations: tuple[Array, ...]
     counts: Counts = field(default_factory=Counts)
-    discrepancy: tuple[tuple[NDArray[np.int64], Array], ...] = ()
+    discrepancy: tuple[Part, ...] = ()
+    held: Mapping[str, float] = field(default_factory=dict)
     _measured: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         self._measured = self.features.measured
+        rows = np.sort(np.concatenate([rows for rows, _ in self.whitener]))
+        assert np.array_equal(rows, np.arange(self.features.size)), (
+            "the whitener must cover each feature once"
+        )
 
     @property
     def simulations(self) -> int:
@@ -273,7 +283,7 @@ class Problem:
         """Whitened (measured - predicted), (size,); FAILED where the simulation diverges."""
         self.counts.simulations += 1
         try:
-            predicted = self.features.predict(self.rig, model, values)
+            predicted = self.features.predict(self.rig, model, {**self.held, **values})
         except PlantDiverged:
             self.counts.failures += 1
             return np.full(self._measured.size, FAILED)
@@ -323,40 +333,52 @@ def build_problem(
             columns.append([(m - b).mean(axis=0) * factor for m, b in zip(moved, base, strict=True)])
             break
 
-    whitener = []
-    discrepancy: list[tuple[NDArray[np.int64], Array]] = []
-    for condition in features.conditions:
-        own = [k for k, block in enumerate(features.blocks) if block.condition == condition]
-        n = features.blocks[own[0]].n
-        v = np.concatenate([variances[k] for k in own])
+    whitener: list[Part] = []
+    discrepancy: list[Part] = []
+    for trial, condition in dict.fromkeys((block.trial, block.condition) for block in features.blocks):
+        own = [k for k, b in enumerate(features.blocks) if (b.trial, b.condition) == (trial, condition)]
         jacobian = (
             np.column_stack([np.concatenate([column[k] for k in own]) for column in columns])
             if columns
-            else np.zeros((v.size, 0))
+            else np.zeros((sum(variances[k].size for k in own), 0))
         )
-        power = np.ones(jacobian.shape[1])
-        if n >= 3 and jacobian.shape[1] and len({features.blocks[k].n for k in own}) == 1:
-            e = np.concatenate([deviations[k] for k in own], axis=1)
-            power, v = _estimate_scatter(e, jacobian, v)
-        single = np.diag(v) + (jacobian * power) @ jacobian.T
-        blocks = [features.blocks[k] for k in own]
-        form = _own_error(blocks, rig, model)
-        fresh = all(features.trials[b.trial].anew for b in blocks)
-        for part, count in _parts(features, own, n):
-            rows = np.concatenate(
-                [np.arange(features.slices[k].start + a, features.slices[k].start + b) for k, a, b in part]
-            )
-            if not rows.size:
-                continue
-            covariance = single / count
-            # In the drift an error of the first closure alone counts; the form of the model is the same for the others.
-            share = 1.0 if part[0][1] == 0 else 0.0 if fresh else 0.5 / count
-            own_error = share**2 * form
+        single = _covariance_of_one(features, own, variances, deviations, jacobian)
+        form = _own_error([features.blocks[k] for k in own], rig, model)
+        for part in _parts(features, own):
+            covariance = single[part.ix] / np.maximum.outer(part.count, part.count)
+            own_error = np.outer(part.share, part.share) * form[part.ix]
             if own_error.any():
                 covariance = covariance + own_error
-                discrepancy.append((rows, np.asarray(np.linalg.cholesky(own_error), dtype=np.float64)))
-            whitener.append((rows, np.linalg.cholesky(covariance)))
+                discrepancy.append((part.rows, _factor(own_error)))
+            whitener.append((part.rows, _factor(covariance)))
     return Problem(rig, features, tuple(whitener), tuple(deviations), counts or Counts(), tuple(discrepancy))
+
+
+def _factor(covariance: Array) -> Array:
+    return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+
+
+def _covariance_of_one(
+    features: Features,
+    own: Sequence[int],
+    variances: Sequence[Array],
+    deviations: Sequence[Array],
+    jacobian: Array,
+) -> Array:
+    """Covariance of one closure over the phases of the blocks `own` of one recording and condition, one after another.
+
+    jacobian   (phases, k) sensitivities to the scatter
+    Where signals cover different numbers of closures, those that cover the most tell the scatter.
+    """
+    v = np.concatenate([variances[k] for k in own])
+    power = np.ones(jacobian.shape[1])
+    most = max(features.blocks[k].n for k in own)
+    if most >= 3 and jacobian.shape[1]:
+        full = [k for k in own if features.blocks[k].n == most]
+        told = np.concatenate([np.full(variances[k].size, features.blocks[k].n == most) for k in own])
+        e = np.concatenate([deviations[k] for k in full], axis=1)
+        power, v[told] = _estimate_scatter(e, jacobian[told], v[told])
+    return np.asarray(np.diag(v) + (jacobian * power) @ jacobian.T)
 
 
 def _own_error(blocks: Sequence[Block], rig: Rig, model: Model) -> Array:
@@ -385,19 +407,48 @@ def _pooled(features: Features, variances: Sequence[Array]) -> list[Array]:
     return out
 
 
-def _parts(features: Features, own: Sequence[int], n: int) -> list[tuple[list[tuple[int, int, int]], float]]:
-    """Mean and drift parts of a condition's blocks, each with the count that divides the covariance of one closure."""
-    mean = [(k, 0, features.blocks[k].phase.size) for k in own]
-    parts: list[tuple[list[tuple[int, int, int]], float]] = [(mean, float(n))]
-    drift = [
-        (k, features.blocks[k].phase.size, features.blocks[k].size)
-        for k in own
-        if features.blocks[k].size > features.blocks[k].phase.size
-    ]
-    if len(drift) == len(own):
-        ramp = np.linspace(-0.5, 0.5, n)
-        parts.append((drift, float(ramp @ ramp)))
-    return parts
+@dataclass(frozen=True)
+class _Rows:
+    """Mean or drift of blocks that belong together.
+
+    rows    (p,) of the features
+    ix      where they are among the phases of those blocks, as np.ix_ gives it
+    count   (p,) what divides the covariance of one closure: of two rows the larger one, as if the closures that the one
+            signal covers were among those of the other
+    share   (p,) part of the model's own error that they have
+    """
+
+    rows: NDArray[np.int64]
+    ix: tuple[NDArray[np.int64], ...]
+    count: Array
+    share: Array
+
+
+def _parts(features: Features, own: Sequence[int]) -> list[_Rows]:
+    """Mean and drift of the blocks of one recording and condition.
+
+    In the drift an error of the first closure alone counts; the form of the model is the same for the others.  Where
+    all begin anew there is no such first.
+    """
+    blocks = [features.blocks[k] for k in own]
+    anew = features.trials[blocks[0].trial].anew
+    begins = np.cumsum([0, *(b.phase.size for b in blocks)])
+    out = []
+    for drift in (False, True):
+        rows, places, counts = [], [], []
+        for k, block, begin in zip(own, blocks, begins[:-1], strict=True):
+            if drift and block.size == block.phase.size:
+                continue
+            ramp = np.linspace(-0.5, 0.5, block.n)
+            start = features.slices[k].start + (block.phase.size if drift else 0)
+            rows.append(np.arange(start, start + block.phase.size))
+            places.append(np.arange(begin, begin + block.phase.size))
+            counts.append(np.full(block.phase.size, float(ramp @ ramp) if drift else float(block.n)))
+        if rows:
+            count, at = np.concatenate(counts), np.concatenate(places)
+            share = np.ones(count.size) if not drift else np.zeros(count.size) if anew else 0.5 / count
+            out.append(_Rows(np.concatenate(rows), np.ix_(at, at), count, share))
+    return out
 
 
 def _smooth(values: Array, width: int = 9) -> Array:

@@ -58,13 +58,11 @@ REACH = 8.0
 class Scan:
     """Scans on one problem.
 
-    rows    features that take part; None: all
     nominal bases with their nuisance parameters at the nominal values, as far as they are known
     minima  of a base that has several, the others
     """
 
     problem: Problem
-    rows: NDArray[np.bool_] | None = None
     nominal: dict[bytes, Fit] = field(default_factory=dict)
     minima: dict[bytes, tuple[Fit, ...]] = field(default_factory=dict)
 
@@ -136,15 +134,9 @@ class Scan:
         kept = {**start, **base.point}
         problem, costs = seen_from(self.problem, base), []
         for one in (start, kept):
-            r = problem.residual(model, {c.name: c.value(one.get(c.name, 0.0)) for c in coordinates})[
-                self.use
-            ]
+            r = problem.residual(model, {c.name: c.value(one.get(c.name, 0.0)) for c in coordinates})
             costs.append(float(r @ r) + sum(one.get(c.name, 0.0) ** 2 for c in coordinates if c.prior))
         return start if costs[0] <= costs[1] else kept
-
-    @property
-    def use(self) -> slice | NDArray[np.bool_]:
-        return slice(None) if self.rows is None else self.rows
 
 
 class _Place:
@@ -155,7 +147,7 @@ class _Place:
     ) -> None:
         self.place, self.model, self.coordinates = place, model, coordinates
         self.own = {c.name: c for c in effect_coordinates(kind)}
-        self.here, self.problem, self.use = place.point, seen_from(scan.problem, place), scan.use
+        self.here, self.problem = place.point, seen_from(scan.problem, place)
 
     def scored(
         self, shapes: Sequence[Point], strengths: Mapping[str, Sequence[float]], *, last: bool
@@ -206,9 +198,7 @@ class _Place:
         """Cost of a start after the linear best move of the place's coordinates."""
         residual = self.at(start) if residual is None else residual
         place = self.place
-        cost, z = linear_minimum(
-            place.jacobian[self.use], residual[self.use], place.z, prior_weights(place.coordinates)
-        )
+        cost, z = linear_minimum(place.jacobian, residual, place.z, prior_weights(place.coordinates))
         bounds = np.array([c.bounds for c in place.coordinates]).reshape(-1, 2)
         for k, c in enumerate(place.coordinates):
             if c.prior:
@@ -221,8 +211,8 @@ class _Place:
         """Least cost along one more direction, with the place's coordinates compensating, and how far along it."""
         place = self.place
         cost, z = linear_minimum(
-            np.column_stack([place.jacobian[self.use], derivative[self.use]]),
-            place.residual[self.use],
+            np.column_stack([place.jacobian, derivative]),
+            place.residual,
             np.append(place.z, 0.0),
             np.append(prior_weights(place.coordinates), 0.0),
         )
@@ -242,8 +232,8 @@ class _Place:
         )
         none = np.zeros(len(strengths))
         cost, moved = linear_minimum(
-            np.column_stack([place.jacobian[self.use], added[self.use]]),
-            place.residual[self.use],
+            np.column_stack([place.jacobian, added]),
+            place.residual,
             np.append(place.z, none),
             np.append(prior_weights(place.coordinates), none),
         )

@@ -16,7 +16,7 @@ from hannes_sim.effect import EffectType, load_effect
 from numpy.typing import NDArray
 
 from .cache import Codec, NotPlain, Store, code_hash, content_hash
-from .errors import Fixed, SignalError
+from .errors import SignalError
 from .executor import Executor, Held, own
 from .fit import Fit, finite_differences, fit, over_its_spread, spread
 from .problem import (
@@ -143,7 +143,6 @@ class Search:
     sources: Mapping[str, str]
     executor: Executor = field(default_factory=Executor)
     progress: Progress = silent
-    rows: NDArray[np.bool_] | None = None
     before: Candidate | None = None
     thorough: bool = False
     found: dict[Names, Candidate] = field(default_factory=dict)
@@ -154,7 +153,7 @@ class Search:
 
     def __post_init__(self) -> None:
         self.coordinates = tuple(nuisance_coordinate(n) for n in self.nuisances)
-        self.scan = Scan(self.problem, self.rows, self._nominal, self._minima)
+        self.scan = Scan(self.problem, self._nominal, self._minima)
 
     @property
     def slow(self) -> bool:
@@ -184,19 +183,19 @@ class Search:
         return sorted(found, key=lambda f: f.cost)
 
     def _begin(self, start: Mapping[str, float]) -> Fit:
-        return fit(self.problem, self.model, self.coordinates, start, rows=self.rows, evaluations=WHOLE)
+        return fit(self.problem, self.model, self.coordinates, start, evaluations=WHOLE)
 
     def _ended(self, found: Fit) -> Fit:
         """A fit, perhaps of another problem (other noise), carried on until it stays."""
         if self.slow:
             return self._again(found, WHOLE)
-        found = at_anchor(self.problem, found, self.rows)[1]
+        found = at_anchor(self.problem, found)[1]
         for _ in range(MOVES):
             new = self._again(found, WHOLE)
             gain = found.cost - new.cost
             if gain > 0.0:
                 found = new
-            if gain < least_gain(found, self.rows):
+            if gain < least_gain(found):
                 break
         return self._led_back(found)
 
@@ -252,11 +251,10 @@ class Search:
                     model,
                     coordinates,
                     at,
-                    rows=self.rows,
                     evaluations=15,
                 )
                 # Costs that were seen from different places cannot be compared before the anchor is there.
-                found.append(at_anchor(self.problem, one, self.rows)[1])
+                found.append(at_anchor(self.problem, one)[1])
                 continue
             ways = [(near, at)]
             if near is not base.fit:
@@ -270,7 +268,6 @@ class Search:
                         model,
                         coordinates,
                         begin,
-                        rows=self.rows,
                         known=_derivatives(point, [c for c in point.coordinates if short or c.prior]),
                         evaluations=SHORT if short else LONG,
                         little=ROUGH,
@@ -294,7 +291,6 @@ class Search:
                 model,
                 coordinates,
                 _still(coordinates, start, nominal),
-                rows=self.rows,
                 evaluations=MIDDLE,
                 little=ROUGH,
             )
@@ -344,7 +340,6 @@ class Search:
                 best.model,
                 best.coordinates,
                 at,
-                rows=self.rows,
                 known={} if self.slow else _derivatives(base.fit),
                 evaluations=LONG,
                 worth=worth - _penalty(best.coordinates),
@@ -360,14 +355,13 @@ class Search:
                 found.model,
                 found.coordinates,
                 found.z,
-                rows=self.rows,
                 known=_derivatives(found, [c for c in found.coordinates if c.prior]),
                 evaluations=LONG,
                 worth=worth - _penalty(found.coordinates),
             )
         if whole:
-            return settle(self.problem, found, self.rows, afresh=True)[1]
-        return settle(self.problem, found, self.rows, moves=2)[1]
+            return settle(self.problem, found, afresh=True)[1]
+        return settle(self.problem, found, moves=2)[1]
 
     def _known(self, candidate: Candidate) -> Candidate:
         known = self.found.get(candidate.key)
@@ -398,7 +392,7 @@ class Search:
         goes on with those over longer or shorter ones.
         """
         if self.slow:
-            return settle(self.problem, old, self.rows, afresh=True)[1]
+            return settle(self.problem, old, afresh=True)[1]
         found = self._over_steps(old, evaluations, 1.0)
         for length in STEPS:
             found = min(found, self._over_steps(found, evaluations, length), key=lambda f: f.cost)
@@ -411,7 +405,6 @@ class Search:
             old.model,
             old.coordinates,
             old.z,
-            rows=self.rows,
             steps={name: length * step for name, step in spread(old).items()},
             evaluations=evaluations,
         )
@@ -432,13 +425,11 @@ class Search:
                 break
             tried.add(held.name)
             others = [c for c in found.coordinates if c is not held]
-            problem = Fixed(self.problem, {held.name: held.value(0.0)})
-            rest = fit(problem, found.model, others, found.point, rows=self.rows, evaluations=LONG)
+            problem = replace(self.problem, held={held.name: held.value(0.0)})
+            rest = fit(problem, found.model, others, found.point, evaluations=LONG)
             if rest.cost < found.cost:
                 whole = {**rest.point, held.name: 0.0}
-                again = fit(
-                    self.problem, found.model, found.coordinates, whole, rows=self.rows, evaluations=SHORT
-                )
+                again = fit(self.problem, found.model, found.coordinates, whole, evaluations=SHORT)
                 found = min(found, again, key=lambda f: f.cost)
         return found
 
@@ -469,7 +460,7 @@ class Search:
     def from_point(self, names: Names, start: Mapping[str, float]) -> Candidate:
         """Fit a set of effects from one point (z by name)."""
         model, coordinates = self.with_effects(names)
-        found = fit(self.problem, model, coordinates, start, rows=self.rows, evaluations=WHOLE)
+        found = fit(self.problem, model, coordinates, start, evaluations=WHOLE)
         return self._known(_candidate(names, found))
 
     def _refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
@@ -690,7 +681,7 @@ class Search:
     def _shared(self) -> tuple[Any, ...]:
         """What the result of every item depends on."""
         sources = dict(self.sources)
-        return (self.problem, self.model, tuple(self.nuisances), sources, self.rows, self.thorough)
+        return (self.problem, self.model, tuple(self.nuisances), sources, self.thorough)
 
     @property
     def _codec(self) -> Codec:
@@ -745,14 +736,13 @@ def _work(
     """One item in a worker, which keeps the search for the next ones: (result, simulations, failures)."""
 
     def build() -> Search:
-        problem, model, nuisances, sources, rows, thorough, points, minima = shared
+        problem, model, nuisances, sources, thorough, points, minima = shared
         problem = replace(problem, rig=own(problem.rig), counts=Counts())
         return Search(
             problem,
             model,
             nuisances,
             sources,
-            rows=rows,
             thorough=thorough,
             _nominal=dict(points),
             _minima=dict(minima),

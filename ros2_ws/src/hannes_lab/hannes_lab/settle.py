@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 from hannes_sim.plant import PlantDiverged
-from numpy.typing import NDArray
 
 from .fit import Fit, fit, prior_weights, spread
 from .problem import Problem
@@ -22,10 +20,9 @@ LITTLE = 0.005
 does not explain; so does a fit that is carried on."""
 
 
-def least_gain(found: Fit, rows: NDArray[np.bool_] | None) -> float:
+def least_gain(found: Fit) -> float:
     """By how much a further move of a fit must lower its cost."""
-    samples = found.residual.size if rows is None else int(rows.sum())
-    return max(SETTLED, LITTLE * (found.cost - samples))
+    return max(SETTLED, LITTLE * (found.cost - found.residual.size))
 
 
 def seen_from(problem: Problem, found: Fit) -> Problem:
@@ -33,20 +30,18 @@ def seen_from(problem: Problem, found: Fit) -> Problem:
     return problem.with_rig(anchored_at(problem.rig, found.model, found.values))
 
 
-def at_anchor(problem: Problem, found: Fit, rows: NDArray[np.bool_] | None) -> tuple[Problem, Fit]:
+def at_anchor(problem: Problem, found: Fit) -> tuple[Problem, Fit]:
     """The problem with its anchor at a fit, and the fit with the residual that the slow plant has there."""
     problem = seen_from(problem, found)
     residual = problem.residual(found.model, found.values)
-    used = residual if rows is None else residual[rows]
     prior = prior_weights(found.coordinates)
-    cost = float(used @ used + (prior * found.z) @ (prior * found.z))
+    cost = float(residual @ residual + (prior * found.z) @ (prior * found.z))
     return problem, replace(found, residual=residual, cost=cost)
 
 
 def settle(
     problem: Problem,
     found: Fit,
-    rows: NDArray[np.bool_] | None = None,
     *,
     moves: int = MOVES,
     afresh: bool = False,
@@ -59,18 +54,16 @@ def settle(
     """
     if not isinstance(problem.rig, AnchoredRig):
         return problem, found
-    problem, best = at_anchor(problem, found, rows)
+    problem, best = at_anchor(problem, found)
     problem = _sloped(problem, best, afresh)
     astray = not afresh
     for _ in range(moves):
-        new = fit(
-            problem, best.model, best.coordinates, best.z, rows=rows, steps=spread(best), evaluations=15
-        )
-        least = least_gain(best, rows)
+        new = fit(problem, best.model, best.coordinates, best.z, steps=spread(best), evaluations=15)
+        least = least_gain(best)
         if best.cost - new.cost < least:
             break
         failures = problem.failures
-        there, new = at_anchor(problem, new, rows)
+        there, new = at_anchor(problem, new)
         if problem.failures > failures:
             break
         there = _taught(there, problem, new)

@@ -46,19 +46,20 @@ def position_periods(
     """
     features = problem.features
     predicted = features.closures(problem.rig, fit.model, fit.values)
-    places = {b.condition: b for b in features.blocks if b.signal == "encoder_position"}
+    places = {(b.trial, b.condition): b for b in features.blocks if b.signal == "encoder_position"}
     curves: list[tuple[Array, Array]] = []
-    spans: dict[str, float] = {}
+    spans: dict[tuple[int, str], float] = {}
     # A force shows the ripple itself; the position shows its double integral, in which slow errors hide it.
     drive = [
         signal for signal in problem.rig.drive_signals if any(b.signal == signal for b in features.blocks)
     ]
     for block, model in zip(features.blocks, predicted, strict=True):
-        if block.condition in places and (not drive or block.signal == drive[0]):
-            place = places[block.condition]
+        where = block.trial, block.condition
+        if where in places and (not drive or block.signal == drive[0]):
+            place = places[where]
             x = np.interp(block.phase, place.phase, place.measured.mean(axis=0))
             curves.append((x, (block.measured - model).mean(axis=0)))
-            spans[block.condition] = float(np.ptp(x))
+            spans[where] = float(np.ptp(x))
     if not curves:
         return ()
     total = max(float(x.max()) for x, _ in curves) - min(float(x.min()) for x, _ in curves)

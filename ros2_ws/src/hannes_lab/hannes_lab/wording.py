@@ -29,11 +29,6 @@ CLOCK_PART = 0.25
 CLOCK_STEPS = 6
 """Length of the fit that tells it."""
 
-BENT = 2
-STAYS = 2.0
-"""Of recordings of another machine: so many well-known parameters far off, and an error on what took no part in the fit
-above so many times the repeatability, and the model as it is was only bent to what is missing."""
-
 MANY_FAILURES = 0.05
 """Part of the simulations that did not stay finite from which on their parameters are worth a look."""
 
@@ -89,26 +84,14 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
     """Why what leaves no more than chance and the model's own error is no answer; empty if it is one.
 
     Where a set of effects takes a machine far outside its tolerances as well, and the error on what took no part in the
-    fit does not fall to half of what it is above the repeatability, the effects only help to bend the model.  Without
-    effects it is bent where BENT well-known parameters must be far off, and the error still stays above STAYS.
+    fit does not fall to half of what it is above the repeatability, the effects only help to bend the model.
     """
     best, before, after = choice.best, falls[1], falls[-1]
-    if not (best.far_off and choice.search.problem.discrepancy):
+    if not (best.names and best.far_off and choice.search.problem.discrepancy):
         return ""
     pairs = ((before.held_out, after.held_out), (before.held_out_conditions, after.held_out_conditions))
     known = [(a, b) for a, b in pairs if np.isfinite([a, b]).all()]
-    if not known:
-        return ""
-    if not best.names:
-        far = sum(off > FAR and not c.wide for c, off in best.fit.off)
-        least = min(b for _, b in known)
-        if far < BENT or least <= STAYS:
-            return ""
-        return (
-            f"the model as it is would explain it only with {_far_values(best)}, far outside the tolerance, and the "
-            f"error on what took no part in the fit still stays at {least:.2f} times the repeatability"
-        )
-    if any(halved(a, b) for a, b in known):
+    if not known or any(halved(a, b) for a, b in known):
         return ""
     return (
         f"{' and '.join(best.names)} would explain it only with {_far_values(best)}, far outside the tolerance, and "

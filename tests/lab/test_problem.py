@@ -1,0 +1,101 @@
+"""The noise of a data set, where its signals and recordings hold different numbers of closures."""
+
+from copy import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hannes_description.model import Model
+from hannes_lab.chance import noise_draws
+from hannes_lab.errors import split_closures
+from hannes_lab.features import Block, Features
+from hannes_lab.hide import make_set
+from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.problem import Problem, build_problem
+from hannes_lab.trials import make_trial
+
+NOISE = 0.03
+"""Of a signal's span, by closure: well above what the rig takes for the least."""
+
+
+@pytest.fixture(scope="module")
+def prepared() -> Prepared:
+    model = Model.load()
+    recordings, _ = make_set(model, [], seed=11, closures=13, conditions=("fast", "grasp_fast"))
+    return prepare([make_trial(r) for r in recordings], model)
+
+
+def cut(block: Block, closures: int) -> Block:
+    """The same signal, recorded of the first closures only."""
+    full, compact = (
+        None if index is None else tuple(a[:closures] for a in index) for index in (block.full, block.compact)
+    )
+    return replace(block, measured=block.measured[:closures], full=full, compact=compact, beside=None)
+
+
+def as_measured(prepared: Prepared, features: Features, seed: int = 0) -> Problem:
+    """The problem in which the closures are those of the model and independent noise."""
+    rng = np.random.default_rng(seed)
+    closures = features.closures(prepared.rig, prepared.model, {})
+    blocks = tuple(
+        replace(block, measured=closure + NOISE * np.ptp(closure) * rng.standard_normal(block.measured.shape))
+        for block, closure in zip(features.blocks, closures, strict=True)
+    )
+    return build_problem(prepared.rig, replace(features, blocks=blocks, slices=()), prepared.model, (), {})
+
+
+def mean_square(prepared: Prepared, features: Features, block: int) -> float:
+    """Of the whitened residual of a perfect model in the features of one block, over a few draws of the noise."""
+    return float(
+        np.mean(
+            [
+                (as_measured(prepared, features, seed).residual(prepared.model, {})[features.slices[block]])
+                ** 2
+                for seed in range(6)
+            ]
+        )
+    )
+
+
+@pytest.mark.parametrize("closures", [5, 3])
+def test_a_signal_of_fewer_closures_is_as_uncertain_as_those_make_it(
+    prepared: Prepared, closures: int
+) -> None:
+    features = prepared.features
+    short = next(k for k, b in enumerate(features.blocks) if b.signal == "motor_current")
+    blocks = tuple(cut(b, closures) if k == short else b for k, b in enumerate(features.blocks))
+    fewer = replace(features, blocks=blocks, slices=())
+    problem = as_measured(prepared, fewer)
+    first, second = (problem.residual(prepared.model, {}) for _ in range(2))
+    assert np.isfinite(first).all() and np.array_equal(first, second)
+    assert mean_square(prepared, fewer, short) == pytest.approx(1.0, rel=0.35)
+    assert mean_square(prepared, fewer, (short + 1) % len(blocks)) == pytest.approx(1.0, rel=0.35)
+    halves = split_closures(fewer)
+    assert all(np.isfinite(as_measured(prepared, h).residual(prepared.model, {})).all() for h in halves)
+
+
+def test_two_recordings_of_one_condition_have_closures_of_their_own(prepared: Prepared) -> None:
+    """One of 13 and one of 5 closures: each scatters on its own, and chance draws them apart."""
+    one = prepared.features
+    first = [b for b in one.blocks if b.trial == 0]
+    again = [replace(cut(b, 5), trial=len(one.trials)) for b in first]
+    both = replace(
+        one,
+        trials=(*one.trials, one.trials[0]),
+        blocks=(*one.blocks, *again),
+        ends=(*one.ends, one.ends[0]),
+        slices=(),
+    )
+    rig = copy(prepared.rig)
+    rig.trials = both.trials
+    prepared = replace(prepared, rig=rig)
+    problem = as_measured(prepared, both)
+    assert np.array_equal(problem.residual(prepared.model, {}), problem.residual(prepared.model, {}))
+    for block in (0, len(one.blocks)):
+        assert mean_square(prepared, both, block) == pytest.approx(1.0, rel=0.35)
+    draws, resampled = noise_draws(problem, 200, np.random.default_rng(0))
+    assert resampled
+    mean = [
+        draws[both.slices[k].start : both.slices[k].start + first[0].phase.size] for k in (0, len(one.blocks))
+    ]
+    assert abs(np.corrcoef(mean[0].ravel(), mean[1].ravel())[0, 1]) < 0.05
