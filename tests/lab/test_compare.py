@@ -1,11 +1,14 @@
 """In which phases a comparison puts what was recorded."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hannes_description.model import Model
 from hannes_lab.compare import compare
+from hannes_lab.depends import residual_dependences
+from hannes_lab.features import Features
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.trials import Trial, make_trial
@@ -34,3 +37,27 @@ def test_there_is_contact_where_the_dynamometer_shows_more_than_it_does_at_rest(
     (shown,) = (o for o in found.overlays if o.signal == "encoder_position")
     touched = np.asarray(shown.measured)[np.asarray(shown.phase) == "grasp"]
     assert not presses or touched.min() == pytest.approx(8.6, abs=0.7)
+
+
+def test_an_offset_depends_on_nothing_and_without_an_encoder_place_and_speed_are_unknown(
+    empty: Trial,
+) -> None:
+    model = Model.load()
+    prepared = prepare([empty], model)
+    features, predicted = prepared.features, prepared.features.closures(prepared.rig, model, {})
+
+    def shares(
+        error: Callable[[np.ndarray], np.ndarray], features: Features, *signals: str
+    ) -> dict[str, float]:
+        """Shares for closures that differ from the model by an error as a function of the predicted signal."""
+        chosen = [(b, c) for b, c in zip(features.blocks, predicted, strict=True) if b.signal in signals]
+        blocks = tuple(replace(b, measured=c + error(c)) for b, c in chosen)
+        found = residual_dependences(replace(features, blocks=blocks, slices=()), [c for _, c in chosen])
+        return {d.variable: d.share for d in found}
+
+    both = ("encoder_position", "motor_current")
+    assert max(shares(lambda c: np.full_like(c, 0.2), features, *both).values()) < 1e-6
+    of_load = shares(lambda c: 0.1 * c**2, features, *both)
+    assert max(of_load, key=lambda name: of_load[name]) == "load" and of_load["load"] > 0.5
+    assert set(of_load) == {"position", "velocity", "direction", "load", "time"}
+    assert set(shares(lambda c: 0.1 * c**2, features, "motor_current")) == {"load", "time"}

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from hannes_lab.cache import NotPlain, Store, content_hash
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.executor import Executor
+from hannes_lab.features import Features
 from hannes_lab.hide import make_set, write_set
 from hannes_lab.prepare import Prepared, load_trials, prepare
 from hannes_lab.problem import Problem
@@ -76,20 +78,18 @@ def cluster() -> Iterator[str]:
 
 
 def same(a: Diagnosis, b: Diagnosis) -> bool:
-    """Every number alike, but for the count of simulations."""
-    first, second = a.to_dict(), b.to_dict()
-    del first["simulations"], second["simulations"]
-    return json.dumps(first) == json.dumps(second)
+    """Every number alike, the count of simulations among them."""
+    return json.dumps(a.to_dict()) == json.dumps(b.to_dict())
 
 
 def test_two_processes_give_the_same_numbers(kept: tuple[Diagnosis, Path], serial: Diagnosis) -> None:
     assert [e.name for e in serial.effects] == ["glove_stiffness"]
-    assert same(kept[0], serial) and kept[0].simulations == serial.simulations
+    assert same(kept[0], serial)
 
 
 def test_a_dask_cluster_gives_the_same_numbers(cluster: str, prepared: Prepared, serial: Diagnosis) -> None:
     far = found_with(prepared, Executor(dask=cluster))
-    assert same(far, serial) and far.simulations == serial.simulations
+    assert same(far, serial)
 
 
 def test_no_scheduler_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,10 +100,17 @@ def test_no_scheduler_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_second_run_takes_everything_from_the_store(
-    kept: tuple[Diagnosis, Path], prepared: Prepared, serial: Diagnosis
+    kept: tuple[Diagnosis, Path], prepared: Prepared, serial: Diagnosis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    made, predict = [0], Features.predict
+
+    def counted(*given: Any) -> Any:
+        made[0] += 1
+        return predict(*given)
+
+    monkeypatch.setattr(Features, "predict", counted)
     again = found_with(prepared, Executor(store=Store(kept[1])))
-    assert same(again, serial) and again.simulations < 0.1 * serial.simulations
+    assert same(again, serial) and made[0] < 0.1 * serial.simulations
 
 
 def test_other_data_or_another_model_find_nothing_of_it(prepared: Prepared, tmp_path: Path) -> None:
@@ -218,8 +225,9 @@ def test_ctrl_c_in_the_first_round_and_the_same_command_goes_on(
     out, err = again.communicate()
     assert again.returncode == 0, err
     found, expected = json.loads(out), json.loads(json.dumps(serial.to_dict()))
-    assert found.pop("simulations") < expected.pop("simulations")
     assert found.pop("model_file") is None
+    # The command counts those of the preparation too.
+    assert found.pop("simulations") >= expected.pop("simulations")
     assert found == expected
 
 

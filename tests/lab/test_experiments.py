@@ -2,17 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.executor import Executor
 from hannes_lab.experiments import VISIBLE, separating_experiments
+from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
-from hannes_lab.search import Search
-from hannes_lab.trials import make_trial
+from hannes_lab.search import Candidate, Search
+from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import strength_of
+from hannes_sim.plant import PlantDiverged
 
 
 def distance_of_fits(prepared: Prepared, names: Sequence[str]) -> float:
@@ -47,3 +50,48 @@ def test_nothing_recorded_in_operation_tells_slack_from_an_encoder_offset(undesc
 
 def test_another_recording_tells_slack_from_a_glove(undescribed: Prepared) -> None:
     assert distance_of_fits(undescribed, ["wire_slack", "glove_stiffness"]) > VISIBLE
+
+
+def tied(prepared: Prepared) -> tuple[Search, list[Candidate]]:
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, effect_sources(only=["gravity"]))
+    return search, [search.null(), search.add(search.null(), "gravity")]
+
+
+def test_what_diverges_in_one_condition_leaves_the_others(
+    undescribed: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search, models = tied(undescribed)
+    assert any(e.name == "fast_soft" for e in separating_experiments(undescribed, search, models, keep=8))
+    simulate = HandRig.simulate
+
+    def diverges(self: HandRig, model: Model, values: Any, trial: Trial, reference: Any) -> Any:
+        if trial.name == "fast_soft":
+            raise PlantDiverged("too fast")
+        return simulate(self, model, values, trial, reference)
+
+    monkeypatch.setattr(HandRig, "simulate", diverges)
+    left = separating_experiments(undescribed, search, models, keep=8)
+    assert len(left) == 7 and all(e.name != "fast_soft" for e in left)
+
+
+def test_a_signal_that_never_changes_tells_nothing_apart(undescribed: Prepared) -> None:
+    search, models = tied(undescribed)
+    before = separating_experiments(undescribed, search, models)
+    features = undescribed.features
+    still = replace(features.blocks[0], signal="grip_force", measured=0.0 * features.blocks[0].measured)
+    more = replace(features, blocks=(*features.blocks, still), slices=())
+    assert separating_experiments(replace(undescribed, features=more), search, models) == before
+    # One closure: its roughness stands for the noise.
+    alone = tuple(
+        replace(
+            b,
+            measured=b.measured[:1],
+            full=tuple(a[:1] for a in b.full),
+            compact=None,
+            beside=None,
+        )
+        for b in features.blocks
+    )
+    single = replace(undescribed, features=replace(features, blocks=alone, slices=()))
+    found = separating_experiments(single, search, models)
+    assert found[0].distance == pytest.approx(before[0].distance, rel=1.5)

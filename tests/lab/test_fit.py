@@ -1,9 +1,11 @@
 """A fit in closed loop: derivatives are taken seldom, and it ends where one that takes them always would."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hannes_description.model import Model
-from hannes_lab.fit import Derivatives, fit, prior_weights
+from hannes_lab.fit import Derivatives, Fit, finite_differences, fit, over_its_spread, prior_weights
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import Coordinate, nuisance_coordinate
@@ -108,3 +110,59 @@ def test_derivatives_that_promised_too_much_are_taken_anew_unless_they_are_known
         problem = Curved()
         derivatives(problem, known, most).at(worse, problem.at(worse))
         assert problem.simulations == taken
+
+
+class Cliff(Curved):
+    """The same, which diverges where a is larger than an edge (or anything but what it is)."""
+
+    failed = 1e6
+
+    def __init__(self, edge: float, lowest: float = -np.inf) -> None:
+        super().__init__()
+        self.edge, self.lowest = edge, lowest
+
+    def residual(self, model: object, values: dict[str, float]) -> np.ndarray:
+        if not self.lowest <= values["a"] <= self.edge:
+            self.simulations, self.failures = self.simulations + 1, self.failures + 1
+            return np.full(2, self.failed)
+        return super().residual(model, values)
+
+
+def test_a_derivative_at_the_edge_of_what_can_be_simulated_is_taken_to_the_other_side() -> None:
+    for edge, lowest in ((1.0, -np.inf), (1.0 + 5e-5, 1.0 - 5e-5)):
+        problem = Cliff(edge, lowest)
+        found = finite_differences(
+            problem,  # type: ignore[arg-type]
+            Model.load(),
+            (A, B),
+            BEGIN,
+            problem.at(BEGIN),
+            (0, 1),
+        )
+        np.testing.assert_allclose(found, [[320.0, 20.0], [50.0, 420.0]], rtol=1e-3)
+        assert problem.failures > 0
+    alone = Cliff(1.0, 1.0)
+    found = finite_differences(alone, Model.load(), (A, B), BEGIN, alone.at(BEGIN), (0, 1))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(found[:, 0], 0.0)
+    assert found[1, 1] == pytest.approx(420.0, rel=1e-3)
+
+
+def test_an_interval_at_the_edge_is_taken_from_the_side_that_can_be_simulated() -> None:
+    problem = Cliff(1.0)
+    fit_ = Fit(Model.load(), (A, B), BEGIN, 0.0, problem.at(BEGIN), np.array([[320.0, 20.0], [50.0, 420.0]]))
+    wider = over_its_spread(problem, fit_)  # type: ignore[arg-type]
+    assert problem.failures > 0
+    np.testing.assert_allclose(wider.jacobian, fit_.jacobian, rtol=0.01)
+
+
+def test_a_simulation_that_diverges_costs_more_than_any_that_does_not() -> None:
+    """Of a machine that repeats well an honest error is thousands of its standard deviations."""
+    recordings, _ = make_set(Model.load(), [], seed=1, closures=6, conditions=["fast"], scatter=0.0)
+    prepared = prepare([make_trial(r) for r in recordings], Model.load())
+    fine = replace(
+        prepared.problem, whitener=tuple((rows, 1e-4 * lower) for rows, lower in prepared.problem.whitener)
+    )
+    honest = fine.residual(prepared.model, {"motor.kt": 0.5 * prepared.model.parameters.value("motor.kt")})
+    diverged = fine.residual(prepared.model, {"hand.stiffness": -1e9, "friction.coulomb": float("nan")})
+    assert fine.failures == 1 and honest @ honest > honest.size * 1e6
+    assert diverged @ diverged > 10.0 * (honest @ honest)

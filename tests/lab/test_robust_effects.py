@@ -10,7 +10,6 @@ import pytest
 from hannes_description.model import Model
 from hannes_lab.own_effect import check_own_effects
 from hannes_lab.prepare import prepare
-from hannes_lab.problem import FAILED
 from hannes_lab.trials import make_trial
 from lab.foreign_bags import Signals, hannes_in_one_line, signals_of_set, write_set
 
@@ -95,4 +94,4 @@ def test_a_simulation_that_diverges_is_penalised_and_counted() -> None:
     residual = prepared.problem.residual(
         prepared.model, {"friction.coulomb": math.nan, "hand.stiffness": -1e9}
     )
-    assert np.all(residual == FAILED) and prepared.problem.failures == 1
+    assert np.all(residual == prepared.problem.failed) and prepared.problem.failures == 1

@@ -288,6 +288,14 @@ def test_a_user_who_relaxes_and_pulls_again_grasps_at_one_place() -> None:
     )
 
 
+def test_an_encoder_that_is_logged_too_slowly_shows_no_grasp() -> None:
+    way, pull = [(0.0, 0.0), (1.2, 11.0), (2.6, 11.0), (3.6, 0.0)], [(0.0, 0.2), (2.6, 0.2), (3.0, -0.1)]
+    trial = closing("ball", way, pull)
+    coarse = {name: (time[::100], values[::100]) for name, (time, values) in trial.signals.items()}
+    (seen,) = with_seen_objects([replace(trial, signals=coarse)], Model.load())
+    assert "object" not in seen.options and any("no grasp is seen" in note for note in seen.notes)
+
+
 @pytest.mark.parametrize("pressed", ["object", "noise", "crosstalk"])
 def test_a_dynamometer_shows_what_the_current_does_not(pressed: str) -> None:
     """15 N/rad from 8 rad on: so soft that the current of a quick closure does not stand out.

@@ -14,7 +14,7 @@ from hannes_lab.prepare import prepare
 from hannes_lab.problem import nuisance_coordinate
 from hannes_lab.search import Search
 from hannes_lab.settle import _sloped
-from hannes_lab.surrogate import AnchoredRig, repeated, rig_for
+from hannes_lab.surrogate import AnchoredRig, of_length, rig_for
 from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import strength_of
 from hannes_sim.plant import PlantDiverged
@@ -119,7 +119,7 @@ def test_the_full_hand_fits_its_own_recordings_also_without_a_description():
 def test_later_closures_repeat_the_second(trial):
     reference = trial.reference[: compact_end(trial)]
     known = np.vstack([reference, -reference])
-    whole = repeated(known, trial, trial.reference.size)
+    whole = of_length(known, trial, trial.reference.size)
     assert whole.shape == (2, trial.reference.size)
     np.testing.assert_array_equal(whole[:, : reference.size], known)
     span = np.ptp(trial.reference)

@@ -123,8 +123,11 @@ def _file_hash(file: Path) -> bytes:
 
 
 @cache_once
-def code_hash() -> str:
-    """Hash of the sources and of the versions of the libraries that a result depends on."""
+def code_hash(also: tuple[str, ...] = ()) -> str:
+    """Hash of the sources and of the versions of the libraries that a result depends on.
+
+    also  names of further files of the lab that count
+    """
     found = hashlib.sha256(f"{platform.machine()} {platform.python_version()}".encode())
     for library in ("numpy", "scipy", "numba", "mujoco"):
         found.update(f"{library} {version(library)}".encode())
@@ -132,8 +135,10 @@ def code_hash() -> str:
         spec = find_spec(package)
         for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
             for path in sorted(Path(folder).rglob("*")):
-                idle = package == "hannes_lab" and (
-                    path.parent.name == "validation" or path.name.startswith(NO_RESULT)
+                idle = (
+                    package == "hannes_lab"
+                    and path.name not in also
+                    and (path.parent.name == "validation" or path.name.startswith(NO_RESULT))
                 )
                 if path.suffix in (".py", ".yaml") and not idle:
                     found.update(path.name.encode() + b"\0" + path.read_bytes())
@@ -141,9 +146,9 @@ def code_hash() -> str:
 
 
 # -- the folder -----------------------------------------------------------------------------------------------------
-def default_folder() -> Path:
-    """The user's cache folder (XDG)."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hannes" / "lab"
+def default_folder(name: str = "lab") -> Path:
+    """A folder of the user's cache (XDG)."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hannes" / name
 
 
 class Store:

@@ -15,7 +15,7 @@ import typer
 from hannes_description.errors import HannesError
 from numpy.typing import NDArray
 
-from .cache import content_hash
+from .cache import code_hash, content_hash, default_folder
 from .cli import Scale, Topics, _command, _console, _number, _prepared, _print_json, _Progress
 from .errors import held_out_closures, overall, signal_errors
 from .executor import interruptible
@@ -33,17 +33,14 @@ from .identify import (
     warnings_of,
 )
 from .prepare import Prepared
-from .problem import FAILED, Coordinate, Problem, build_problem, nuisance_coordinate
-from .remembered import Remembered, code_digest, default_cache
+from .problem import Coordinate, Problem, build_problem, nuisance_coordinate
+from .remembered import Remembered
 from .search import Progress
 
 Array = NDArray[np.float64]
 
 GAINS = tuple(f"control.{name}" for name in ("kp", "damping", "current_kp", "current_ki"))
 """Gains of the double PID that may be free: a rollout can change them."""
-
-BAG_SOURCES = ("features.py", "rig.py", "trials.py", "problem.py", "hand.py")
-"""Files of the lab that stand between a simulation and its residual."""
 
 LARGE_MISFIT = 3.0
 """Multiple of the repeatability above which the model, whatever its parameters, does not explain the recordings."""
@@ -166,7 +163,7 @@ def _key(problem: Problem) -> str:
     whitening = hashlib.sha256(
         b"".join(np.ascontiguousarray(lower).tobytes() for _, lower in problem.whitener)
     )
-    return code_digest(BAG_SOURCES) + content_hash(problem.features.trials) + whitening.hexdigest()
+    return code_hash() + content_hash(problem.features.trials) + whitening.hexdigest()
 
 
 def explaining(best: Fit, held: Sequence[Coordinate], by_held: Array) -> list[str]:
@@ -182,8 +179,6 @@ def _notes_of_errors(errors: Mapping[str, float], best: Fit, held: Sequence[str]
 
     held  held parameters that would explain much of the misfit
     """
-    if best.residual.size and np.abs(best.residual).min() >= FAILED:
-        return ["The simulation diverged at the best point; nothing was identified."]
     after, train, held_out = (errors.get(k, math.nan) for k in ("after", "train", "held_out"))
     out = []
     if not math.isfinite(after):
@@ -277,7 +272,7 @@ def command(
             sds=sds,
             starts=starts,
             seed=seed,
-            cache=cache or default_cache(),
+            cache=cache or default_folder("calibrate"),
             progress=progress,
         )
     path = replace(

@@ -101,7 +101,8 @@ NoCache = Annotated[
     bool,
     typer.Option("--no-cache", help="Neither go on from the results that an earlier run kept, nor keep any."),
 ]
-ReportFile = Annotated[Path | None, typer.Option("--report", help="Write a self-contained HTML report here.")]
+REPORT = "a self-contained HTML report, or one picture where the name ends in .png, .svg or .pdf"
+ReportFile = Annotated[Path | None, typer.Option("--report", help=f"Write {REPORT}.")]
 
 _JOBS = max(1, cpu_count())
 """Cores that this process may use: fewer than the machine has in a container or a batch job."""
@@ -611,7 +612,7 @@ def _check_factor(source: str, factor: float) -> None:
 @interruptible
 def report(
     bags: Bags,
-    out: Annotated[Path, typer.Option("--out", help="HTML file to write.")] = Path("report.html"),
+    out: Annotated[Path, typer.Option("--out", help=f"File to write: {REPORT}.")] = Path("report.html"),
     model: ModelFile = "nominal",
     effects: Effects = None,
     objects: Objects = None,
@@ -649,16 +650,19 @@ def report(
 def _write_report(
     path: Path, *, comparison: Comparison, after: Comparison | None, diagnosis: Diagnosis | Addition | None
 ) -> None:
+    from .pictures import ENDINGS, write_picture
     from .report import write_report
 
-    write_report(
-        path,
-        comparison=_finite(comparison.to_dict()),
-        after=_finite(after.to_dict()) if after else None,
-        diagnosis=_finite(diagnosis.to_dict()) if diagnosis else None,
-        title="Hannes: model against measurement",
-        command=_command(),
-    )
+    parts = {
+        "comparison": _finite(comparison.to_dict()),
+        "after": _finite(after.to_dict()) if after else None,
+        "diagnosis": _finite(diagnosis.to_dict()) if diagnosis else None,
+        "title": "Hannes: model against measurement",
+    }
+    if path.suffix.lower() in ENDINGS:
+        write_picture(path, **parts)
+    else:
+        write_report(path, **parts, command=_command())
 
 
 def _say_report(path: Path | None) -> None:

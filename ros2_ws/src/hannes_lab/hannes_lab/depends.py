@@ -15,13 +15,16 @@ Array = NDArray[np.float64]
 
 VARIABLES = ("position", "velocity", "direction", "load", "time")
 BINS = 10
+AT_REST = 1e-3
+"""Part of the largest speed below which there is no direction."""
 
 
 @dataclass(frozen=True)
 class Dependence:
     """Residual of one signal against one variable.
 
-    share    part of the variance of the closures' mean residual that the curve explains (adjusted R2), 0..1
+    share    part of the variance of the closures' mean residual that the curve explains (adjusted R2), 0..1; an offset
+             that is the same everywhere depends on nothing
     centres  (b,) of the variable; curve (b,) mean residual, in the signal's unit
     """
 
@@ -42,7 +45,9 @@ class Dependence:
 
 
 def residual_dependences(features: Features, predicted: list[Array]) -> tuple[Dependence, ...]:
-    """What the residual of the current (or of the first signal there is) depends on."""
+    """What the residual of the current (or of the first signal there is) depends on; without an encoder, on load and
+    time only.
+    """
     residuals: dict[str, list[Array]] = {}
     states: dict[str, list[Array]] = {"position": [], "velocity": [], "direction": [], "load": []}
     for block, closures in zip(features.blocks, predicted, strict=True):
@@ -51,16 +56,16 @@ def residual_dependences(features: Features, predicted: list[Array]) -> tuple[De
     by = {(b.trial, b.condition, b.signal): (b, c) for b, c in zip(features.blocks, predicted, strict=True)}
     for trial, condition in [(b.trial, b.condition) for b in features.blocks if b.signal == signal]:
         target, load = by[(trial, condition, signal)]
+        states["load"].append(load)
         place = by.get((trial, condition, "encoder_position"))
         if place is not None:
             position = np.interp(target.phase, place[0].phase, place[1].mean(axis=0))
-        else:
-            position = load.mean(axis=0)
-        velocity = np.gradient(position, target.phase)
-        for name, values in (("position", position), ("velocity", velocity), ("direction", velocity)):
-            states[name].append(np.tile(values, (target.n, 1)))
-        states["load"].append(load)
-    return _dependences(residuals, states, signal)
+            velocity = np.gradient(position, target.phase)
+            for name, values in (("position", position), ("velocity", velocity), ("direction", velocity)):
+                states[name].append(np.tile(values, (target.n, 1)))
+    # Of a set in which the encoder is not logged everywhere, what depends on it is not known.
+    known = {name: values for name, values in states.items() if len(values) == len(states["load"])}
+    return _dependences(residuals, known, signal)
 
 
 def _dependences(
@@ -79,6 +84,8 @@ def _dependences(
                 [np.repeat(np.linspace(0.0, 1.0, a.shape[0]), a.shape[1]) for a in residuals[signal]]
             )
             target = np.concatenate([a.ravel() for a in residuals[signal]])
+        elif variable not in states:
+            continue
         else:
             values = np.concatenate([a.mean(axis=0) for a in states[variable]])
             target = r
@@ -88,7 +95,7 @@ def _dependences(
 
 def _dependence(variable: str, signal: str, x: Array, y: Array) -> Dependence:
     if variable == "direction":
-        labels = np.sign(x) * (np.abs(x) > 1e-3)
+        labels = np.sign(x) * (np.abs(x) > AT_REST * np.abs(x).max(initial=0.0))
         groups = np.unique(labels)
         index = np.searchsorted(groups, labels)
     else:
@@ -105,7 +112,8 @@ def _dependence(variable: str, signal: str, x: Array, y: Array) -> Dependence:
         centres.append(float(x[own].mean()))
         curve.append(float(y[own].mean()))
         inside += float(((y[own] - y[own].mean()) ** 2).sum())
-    total = float((y**2).sum())
+    total, level = float(((y - y.mean()) ** 2).sum()), float((y**2).sum())
     k, n = len(centres), y.size
-    share = 1.0 - (inside / max(n - k, 1)) / (total / n) if total > 0.0 else 0.0
+    # Of an offset alone rounding is left.
+    share = 1.0 - (inside / max(n - k, 1)) / (total / (n - 1)) if total > 1e-12 * level else 0.0
     return Dependence(variable, signal, float(np.clip(share, 0.0, 1.0)), tuple(centres), tuple(curve))

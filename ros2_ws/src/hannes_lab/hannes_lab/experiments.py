@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 from hannes_control.reference import make_profile
+from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
 from .prepare import Prepared
-from .problem import Coordinate, nuisance_coordinate
+from .problem import Coordinate, nuisance_coordinate, sample_variance
 from .rig import Rig
 from .search import Candidate, Search
 from .surrogate import FAST_PLANT, SLOW_PLANTS
@@ -78,44 +79,56 @@ def separating_experiments(
 
     Each model predicts one closure with its fitted parameters; differences count in units of the sensors' noise and
     scatter as they were seen in these data, after the nuisance parameters have compensated what they can within their
-    tolerances, and the effects' own parameters within what these data leave open.
+    tolerances, and the effects' own parameters within what these data leave open.  A condition in which one of the
+    models diverges is left out.
     """
     if not prepared.rig.experiments:
         return ()
     tied = tied[:4]
     noise = _noise(prepared)
     out = []
+    if not noise:
+        return ()
     for name, profile, options, grasp in CANDIDATES:
         trial = _trial(prepared.features.trials[0], name, profile, options, grasp)
         rig = type(prepared.rig)([trial])  # type: ignore[call-arg]  # the protocol has no constructor
-        open_ = [_open(rig, c) for c in tied]
-        predictions = [_predict(rig, c, trial, noise, o) for c, o in zip(tied, open_, strict=True)]
-        of_all = _sensitivity(rig, tied[0], trial, noise, open_[0], predictions[0])
-        of_effects = [
-            _sensitivity(rig, c, trial, noise, o, p, _found(c))
-            for c, o, p in zip(tied, open_, predictions, strict=True)
-        ]
-        distances = []
-        for a, b in itertools.combinations(range(len(tied)), 2):
-            d = predictions[a] - predictions[b]
-            sensitivity = np.column_stack([of_all, of_effects[a], of_effects[b]])
-            reduced = d - sensitivity @ np.linalg.solve(
-                sensitivity.T @ sensitivity + np.eye(sensitivity.shape[1]), sensitivity.T @ d
-            )
-            distances.append(float(np.sqrt(max(float(d @ reduced), 0.0))))
-        out.append(
-            Experiment(name, profile, dict(options), grasp, min(distances), tuple(c.names for c in tied))
-        )
+        try:
+            distance = _least_distance(rig, tied, trial, noise)
+        except PlantDiverged:
+            continue
+        out.append(Experiment(name, profile, dict(options), grasp, distance, tuple(c.names for c in tied)))
     return tuple(sorted(out, key=lambda e: -e.distance)[:keep])
 
 
+def _least_distance(rig: Rig, tied: Sequence[Candidate], trial: Trial, noise: dict[str, float]) -> float:
+    """Least whitened distance between any two tied models; PlantDiverged where one of them diverges."""
+    open_ = [_open(rig, c) for c in tied]
+    predictions = [_predict(rig, c, trial, noise, o) for c, o in zip(tied, open_, strict=True)]
+    of_all = _sensitivity(rig, tied[0], trial, noise, open_[0], predictions[0])
+    of_effects = [
+        _sensitivity(rig, c, trial, noise, o, p, _found(c))
+        for c, o, p in zip(tied, open_, predictions, strict=True)
+    ]
+    distances = []
+    for a, b in itertools.combinations(range(len(tied)), 2):
+        d = predictions[a] - predictions[b]
+        sensitivity = np.column_stack([of_all, of_effects[a], of_effects[b]])
+        reduced = d - sensitivity @ np.linalg.solve(
+            sensitivity.T @ sensitivity + np.eye(sensitivity.shape[1]), sensitivity.T @ d
+        )
+        distances.append(float(np.sqrt(max(float(d @ reduced), 0.0))))
+    return min(distances)
+
+
 def _noise(prepared: Prepared) -> dict[str, float]:
-    """Typical standard deviation of one sample of each signal."""
+    """Typical standard deviation of one sample of each signal that changes; of single closures, of their roughness."""
     values: dict[str, list[float]] = {}
     for block in prepared.features.blocks:
-        e = block.measured - block.measured.mean(axis=0)
-        sd = float(np.sqrt((e**2).sum() / max(1, e.size - e.shape[1])))
-        values.setdefault(block.signal, []).append(max(sd, 1e-4 * float(np.ptp(block.measured))))
+        span = float(np.ptp(block.measured))
+        if span > 0.0:
+            e = block.measured - block.measured.mean(axis=0)
+            sd = float(np.sqrt(sample_variance(block.measured, e).mean()))
+            values.setdefault(block.signal, []).append(max(sd, 1e-4 * span))
     return {signal: float(np.median(v)) for signal, v in values.items()}
 
 

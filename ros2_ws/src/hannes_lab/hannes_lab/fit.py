@@ -99,6 +99,9 @@ ROUGHNESS = 20.0
 """Least change of the whitened prediction (root of the sum of squares) by which a derivative along a strength is taken.
 A simulation with dry friction is rough: a change by next to nothing already moves the prediction by about 1."""
 
+INSTEAD = (-1.0, 0.125, -0.125)
+"""Steps of a derivative, as parts of the usual one, that are tried one after another where the simulation diverges."""
+
 WIDEST = 1.0
 WIDEST_LOG = 10.0
 """Longest step of a derivative: along a strength in typical values, and for the logarithm of a shape in usual steps."""
@@ -125,15 +128,22 @@ def finite_differences(
 
     steps   step by coordinate name, the coordinate's own if it is not there; a longer one is put in where the change
             was too small for the simulation's roughness
+    Where a simulation diverges, the other direction is tried, then shorter steps; what diverges all around has a
+    derivative of zero.
     """
     out = np.empty((residual.size, len(columns)))
     steps = {} if steps is None else steps
     values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
 
     def derivative(c: Coordinate, here: float) -> tuple[Array, float]:
-        step = c.inside_step(here, steps.get(c.name))
-        moved = problem.residual(model, {**values, c.name: c.value(here + step)})
-        return (moved - residual) / step, abs(step)
+        whole, (low, high) = c.inside_step(here, steps.get(c.name)), c.bounds
+        for step in (whole, *(part * whole for part in INSTEAD)):
+            if low <= here + step <= high:
+                failures = problem.failures
+                moved = problem.residual(model, {**values, c.name: c.value(here + step)})
+                if problem.failures == failures:
+                    return (moved - residual) / step, abs(step)
+        return np.zeros(residual.size), np.inf
 
     for k, j in enumerate(columns):
         c, here = coordinates[j], float(z[j])
@@ -173,10 +183,16 @@ def over_its_spread(problem: Problem, found: Fit) -> Fit:
         for j, c in enumerate(found.coordinates):
             z, (low, high) = float(found.z[j]), c.bounds
             ends = max(z - steps[c.name], low), min(z + steps[c.name], high)
-            failures = problem.failures
-            there = [problem.residual(found.model, {**found.values, c.name: c.value(end)}) for end in ends]
-            if problem.failures == failures and ends[1] > ends[0]:
-                jacobian[:, j] = (there[1] - there[0]) / (ends[1] - ends[0])
+            there = [(z, found.residual)]
+            for end in ends:
+                failures = problem.failures
+                residual = problem.residual(found.model, {**found.values, c.name: c.value(end)})
+                if problem.failures == failures:
+                    there.append((end, residual))
+            # The residual at the fit serves where one end diverges.
+            (a, before), (b, after) = there[-2:] if len(there) > 1 else there * 2
+            if b != a:
+                jacobian[:, j] = (after - before) / (b - a)
         found = replace(found, jacobian=jacobian)
     return found
 

@@ -144,13 +144,13 @@ class Curve(NamedTuple):
 
 
 def closing_curve(trial: Trial, model: Model) -> Curve | None:
-    """The curve of the mean closing; None without an encoder.
+    """The curve of the mean closing; None without an encoder, or where it is logged too slowly to show one.
 
     The current is that which a hand without inertia and viscous friction would have taken.  Where none is recorded,
     that which the nominal controller would ask for if the hand stood still.  A logger that rectifies loses its sign:
     where the hand brakes, an object or its motor may brake it.
     """
-    if "encoder_position" not in trial.signals:
+    if not _followed(trial):
         return None
     closures = trial.of(trial.conditions[0])
     phase = _phase(trial)
@@ -188,6 +188,14 @@ def _span(trial: Trial) -> float:
     return max(SMOOTH, SAMPLES * float(np.median(np.diff(trial.signals["encoder_position"][0]))))
 
 
+def _followed(trial: Trial) -> bool:
+    """Whether an encoder is logged, often enough that a closure is longer than what its curves are smoothed over."""
+    if "encoder_position" not in trial.signals:
+        return False
+    phase = _phase(trial)
+    return _window(phase, _span(trial)) <= phase.size
+
+
 def _window(phase: Array, span: float) -> int:
     """That span as an odd number of points."""
     return 2 * max(round(0.5 * span / float(phase[1] - phase[0])), 2) + 1
@@ -195,7 +203,7 @@ def _window(phase: Array, span: float) -> int:
 
 def _felt(trial: Trial, model: Model) -> tuple[float, float] | None:
     """Stiffness at the pulley (N.m/rad) and place (rad) of an object whose force was recorded; None if none is felt."""
-    if not {"grip_force", "encoder_position"} <= set(trial.signals):
+    if "grip_force" not in trial.signals or not _followed(trial):
         return None
     phase = _phase(trial)
     position = trial.mean_closure("encoder_position", phase)

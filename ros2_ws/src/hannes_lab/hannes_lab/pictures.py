@@ -54,6 +54,9 @@ WIDTH, HEAD = 14.0, 1.15
 MAX_CONDITIONS, MAX_SIGNALS = 4, 3
 """What one picture can hold; the report has all."""
 
+ENDINGS = (".png", ".svg", ".pdf")
+"""Of files that a picture can be written to."""
+
 Curve = Sequence[float | None]
 
 
@@ -71,7 +74,7 @@ def write_picture(
     Raises HannesError if there is nothing to draw, the ending is not known, or the file cannot be written.
     """
     out = Path(path)
-    if out.suffix.lower() not in (".png", ".svg", ".pdf"):
+    if out.suffix.lower() not in ENDINGS:
         raise HannesError(
             f"A picture cannot be written as '{out.name}': the name must end in .png, .svg or .pdf."
         )

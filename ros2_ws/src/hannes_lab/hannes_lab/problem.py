@@ -42,7 +42,9 @@ CHANCE = 2.0
 """Standard deviations above its mean that noise may make the sum of squares of a signal without being an error."""
 
 FAILED = 1e3
-"""Whitened residual of a simulation that diverged: a large finite penalty."""
+WORSE = 10.0
+"""Whitened residual of a simulation that diverged: a large finite penalty, at least FAILED and so many times the
+largest of a machine that stands still.  Where a machine repeats well, an honest error may be more than FAILED."""
 
 AT_END = 1e-3
 """Part of a parameter's range within which it is at the end of it: a fit stops short of its bounds."""
@@ -225,6 +227,11 @@ class Problem:
     def failures(self) -> int:
         return self.counts.failures
 
+    @cached_property
+    def failed(self) -> float:
+        """The whitened residual of a simulation that diverged; see WORSE."""
+        return max(FAILED, WORSE * float(np.abs(self.whiten(self._measured)).max(initial=0.0)))
+
     def with_rig(self, rig: Rig) -> Problem:
         """The same data and noise seen with another rig; the counts go on together."""
         return self if rig is self.rig else replace(self, rig=rig)
@@ -280,13 +287,13 @@ class Problem:
         return out
 
     def residual(self, model: Model, values: Mapping[str, float]) -> Array:
-        """Whitened (measured - predicted), (size,); FAILED where the simulation diverges."""
+        """Whitened (measured - predicted), (size,); `failed` in each where the simulation diverges."""
         self.counts.simulations += 1
         try:
             predicted = self.features.predict(self.rig, model, {**self.held, **values})
         except PlantDiverged:
             self.counts.failures += 1
-            return np.full(self._measured.size, FAILED)
+            return np.full(self._measured.size, self.failed)
         return self.whiten(self._measured - predicted)
 
 
@@ -315,7 +322,7 @@ def build_problem(
     for block, e in zip(features.blocks, deviations, strict=True):
         span = float(np.ptp(block.measured)) or 1.0
         floor = (rig.floor * span) ** 2
-        variances.append(_sample_variance(block.measured, e) + floor)
+        variances.append(sample_variance(block.measured, e) + floor)
     if rig.pooled:
         variances = _pooled(features, variances)
     columns: list[list[Array]] = []
@@ -460,7 +467,7 @@ def _smooth(values: Array, width: int = 9) -> Array:
     return out
 
 
-def _sample_variance(measured: Array, deviations: Array) -> Array:
+def sample_variance(measured: Array, deviations: Array) -> Array:
     """Variance of one sample along the phase (p,), smoothed."""
     n = measured.shape[0]
     if n >= 3:

@@ -6,8 +6,6 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from functools import cache as cache_once
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +26,7 @@ class Remembered:
         self.problem, self.key, self.folder = problem, key, folder
         self.hits = 0
         self.done = 0
+        self.failures = 0
         self._progress = progress
         self.total, self.text = 1, "simulation"
         if folder is not None:
@@ -43,7 +42,12 @@ class Remembered:
         return self.problem.features
 
     def residual(self, model: Model, values: Mapping[str, float]) -> Array:
-        """The residual, from the folder where it is there."""
+        """The residual, from the folder where it is there; what diverged is counted in `failures` either way."""
+        out = self._residual(model, values)
+        self.failures += bool(np.all(out == self.problem.failed))
+        return out
+
+    def _residual(self, model: Model, values: Mapping[str, float]) -> Array:
         self.done += 1
         if self._progress is not None:
             self._progress(self.done, max(self.total, self.done), self.text)
@@ -65,24 +69,3 @@ class Remembered:
             out.astype("<f8").tofile(file)
         part.replace(path)
         return out
-
-
-@cache_once
-def code_digest(lab: tuple[str, ...]) -> str:
-    """Hash of the sources that a simulation depends on: a changed simulator finds no old results.
-
-    lab  files of hannes_lab that count; of the simulator's packages all do
-    """
-    found = hashlib.sha256()
-    for package in ("hannes_description", "hannes_control", "hannes_sim", "hannes_lab"):
-        spec = find_spec(package)
-        for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
-            for path in sorted(Path(folder).rglob("*.py")):
-                if package != "hannes_lab" or path.name in lab:
-                    found.update(path.name.encode() + path.read_bytes())
-    return found.hexdigest()
-
-
-def default_cache() -> Path:
-    """Where residuals are kept when nothing else is said."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hannes" / "calibrate"

@@ -634,7 +634,8 @@ class Search:
     def each(self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], text: str) -> list[Any]:
         """function(search, *item) for every item, wherever the executor works; the same results everywhere.
 
-        What is in the executor's store is taken from there; each result goes there as soon as it is made.
+        What is in the executor's store is taken from there, with the simulations that it took; each result goes there
+        as soon as it is made.
         """
         store = self.executor.store
         keys = self._keys(function, items) if store else {}
@@ -645,13 +646,14 @@ class Search:
             if kept is None:
                 missing.append(k)
             else:
-                out[k] = kept
+                out[k], simulations, failures = kept
+                self._count(simulations, failures)
         done = len(items) - len(missing)
-        for k, result in self._made(function, items, missing):
-            out[k] = result
+        for k, made in self._made(function, items, missing):
+            out[k] = made[0]
             if store and k in keys:
                 with suppress(NotPlain):
-                    store.write(keys[k], self._codec.pack(result))
+                    store.write(keys[k], self._codec.pack(made))
             done += 1
             self.progress(done, len(items), text)
         return out
@@ -662,20 +664,24 @@ class Search:
 
     def _made(
         self, function: Callable[..., Any], items: Sequence[tuple[Any, ...]], missing: Sequence[int]
-    ) -> Iterator[tuple[int, Any]]:
+    ) -> Iterator[tuple[int, tuple[Any, int, int]]]:
+        """The missing items' numbers, each with its result and the simulations and failures that it took."""
         if self.executor.serial or len(missing) < 2:
             bare = replace(self, executor=Executor(), progress=silent)
             for k in missing:
-                yield k, function(bare, *items[k])
+                before = self.problem.simulations, self.problem.failures
+                result = function(bare, *items[k])
+                yield k, (result, self.problem.simulations - before[0], self.problem.failures - before[1])
             return
         work = [(function, items[k]) for k in missing]
         key = f"{next(_runs)} {id(self)} {os.getpid()} {time.time_ns()}"
-        for number, (result, simulations, failures) in self.executor.run(
-            _work, (*self._shared, self._nominal, self._minima), key, work
-        ):
-            self.problem.counts.simulations += simulations
-            self.problem.counts.failures += failures
-            yield missing[number], result
+        for number, made in self.executor.run(_work, (*self._shared, self._nominal, self._minima), key, work):
+            self._count(*made[1:])
+            yield missing[number], made
+
+    def _count(self, simulations: int, failures: int) -> None:
+        self.problem.counts.simulations += simulations
+        self.problem.counts.failures += failures
 
     @property
     def _shared(self) -> tuple[Any, ...]:

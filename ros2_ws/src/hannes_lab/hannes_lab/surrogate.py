@@ -195,7 +195,7 @@ class AnchoredRig:
         key = (self._anchor, trial.name, reference.size)
         if key not in self._corrections:
             self._learn(trial, reference)
-        return repeated(self._corrections[key], trial, size)
+        return of_length(self._corrections[key], trial, size)
 
     def _shortest(self, trial: Trial, reference: Array) -> Array:
         whole = has_memory(self._model) and not trial.anew
@@ -254,18 +254,21 @@ class _Slope:
 
     def on(self, trial: Trial, size: int) -> Array:
         """The derivative for a simulation of `size` ticks: later closures repeat earlier ones."""
-        return repeated(self.signals[trial.name], trial, size)
+        return of_length(self.signals[trial.name], trial, size)
 
 
-def repeated(known: Array, trial: Trial, size: int) -> Array:
+def of_length(known: Array, trial: Trial, size: int) -> Array:
     """Signals (k, size) of a simulation from its begin (k, ticks), which holds all closures that others repeat."""
     if known.shape[1] >= size:
         return known[:, :size]
     index = np.arange(size)
     starts = [round(c.start / trial.period) for c in trial.closures]
-    for start, stop, like in zip(starts, [*starts[1:], size], trial.repeats, strict=True):
+    for closure, start, stop, like in zip(
+        trial.closures, starts, [*starts[1:], size], trial.repeats, strict=True
+    ):
         if stop > known.shape[1]:
-            index[max(start, 0) : stop] = starts[like] + np.arange(stop - max(start, 0))
+            shift = starts[like] - trial.same_place(closure, trial.closures[like])
+            index[max(start, 0) : stop] = shift + np.arange(max(start, 0), stop)
     return known[:, np.clip(index, 0, known.shape[1] - 1)]
 
 

@@ -426,32 +426,31 @@ def _stillest(speed: Array, offset: int) -> tuple[int, int]:
 def group_closures(
     reference: Array, period: float, spans: Iterable[tuple[float, float]], name: str, step: float = 0.0
 ) -> list[Closure]:
-    """Closures whose reference is the same (within 3 % of its span, and 3 % of its length) share a condition.
+    """Closures whose reference is the same (within 3 % of its span, as far as the shorter one goes) share a condition.
 
     step  s between two samples of the logged reference: closures may begin anywhere between two
     Cut-off closures (less than 80 % of the usual length of their condition) are dropped.
     """
-    kinds: list[tuple[Array, float]] = []
+    kinds: list[Array] = []
     members: list[tuple[float, float, int]] = []
     for start, stop in spans:
         shape = reference[
             np.clip(np.arange(round(start / period), round(stop / period) + 1), 0, reference.size - 1)
         ]
         span = float(np.ptp(shape)) or 1.0
-        for index, (other, length) in enumerate(kinds):
+        for index, other in enumerate(kinds):
             n = min(shape.size, other.size)
             slope = _change(shape, step / period)
             alike = (
                 n >= 0.3 * other.size
                 and float(np.max(np.abs(shape[:n] - other[:n]))) <= 0.03 * span + slope + 1e-9
             )
-            longer = max(shape.size, other.size) * period
-            if alike and (abs((stop - start) - length) <= 0.03 * length or n * period < longer):
+            if alike:
                 members.append((start, stop, index))
                 break
         else:
             members.append((start, stop, len(kinds)))
-            kinds.append((shape, stop - start))
+            kinds.append(shape)
     out = []
     for index in range(len(kinds)):
         own = [(a, b) for a, b, i in members if i == index]

@@ -17,9 +17,9 @@ from hannes_description.parameters import data_path
 from rich.console import Console
 from rich.table import Table
 
+from ..cache import default_folder
 from ..cli import _finite, _Progress
 from ..executor import interruptible
-from ..remembered import default_cache
 from . import (
     columns,
     convergence,
@@ -165,12 +165,12 @@ def validate(
     begin = time.monotonic()
     with _Progress(quiet=json) as progress:
         if laws:
-            written = hypotheses.write(starts=starts, cache=default_cache(), progress=progress)
+            written = hypotheses.write(starts=starts, cache=default_folder("calibrate"), progress=progress)
             if not json:
                 typer.echo(f"Laws of R12: {written}")
         if calibrate:
             found = fitting.calibrate_thesis(
-                motor=motor, starts=starts, cache=default_cache(), progress=progress
+                motor=motor, starts=starts, cache=default_folder("calibrate"), progress=progress
             )
             chosen = found.model
             target = model_out or data_path("models", f"{chosen.name}.yaml")

@@ -14,6 +14,7 @@ from hannes_description.model import Model
 from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
+from ..cache import code_hash
 from ..identify import (
     Calibration,
     agreeing,
@@ -25,7 +26,7 @@ from ..identify import (
     warnings_of,
 )
 from ..problem import FAILED, Coordinate
-from ..remembered import Remembered, code_digest
+from ..remembered import Remembered
 from ..search import Progress
 
 Array = NDArray[np.float64]
@@ -68,6 +69,7 @@ class TargetProblem:
     predict: Callable[[Model, Mapping[str, float]], Mapping[str, float]]
     digest: str = ""
     simulations: int = 0
+    failed: float = FAILED
 
     @property
     def features(self) -> _Size:
@@ -101,7 +103,7 @@ def calibrate_targets(
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrate on published figures."""
-    remembered = Remembered(problem, code_digest(FIGURE_SOURCES) + problem.key, cache, progress)
+    remembered = Remembered(problem, code_hash(FIGURE_SOURCES) + problem.key, cache, progress)
     remembered.total = starts * evaluations * (len(coordinates) + 1)
 
     def announce(k: int, n: int) -> None:
