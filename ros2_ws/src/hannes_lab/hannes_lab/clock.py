@@ -28,7 +28,12 @@ def moved(reference: Array, delay: float, lead: float, trial: Trial) -> Array:
     whole = trial.reference if np.array_equal(trial.reference[:n], reference) else reference
     if lead != 0.0:
         whole = whole + lead * np.gradient(moving_mean(whole, RATE_OVER / trial.period), trial.period)
-    out: Array = _later(np.ascontiguousarray(whole), delay / trial.period, n)
+    return later(whole, delay / trial.period, n)
+
+
+def later(values: Array, ticks: float, count: int | None = None) -> Array:
+    """The first `count` values (all if None), later by so many ticks; before the first and after the last, those."""
+    out: Array = _later(np.ascontiguousarray(values), ticks, values.size if count is None else count)
     return out
 
 

@@ -20,7 +20,7 @@ from hannes_sim.plant import Plant
 from hannes_sim.rollout import Rollout, step_of
 from numpy.typing import NDArray
 
-from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD, moved, moving_mean
+from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD, later, moved, moving_mean
 from .features import FINEST, Block
 from .rig import Nuisance, PlantRig, make_controller
 from .trials import Trial
@@ -86,6 +86,12 @@ _APART = 4.0
 recording is no explanation, however well it fits."""
 
 CURRENT_WINDOW = "log.current_window"
+
+SIGNAL_DELAY = "log.delay_of_"
+"""Beginning of the name of how much later a signal is, s, that was by another clock and moved to that of the others."""
+
+MOVED = "moved"
+"""Option of a trial: the names of those signals."""
 
 OWN_ERROR: Mapping[str, float] = {"encoder_position": 0.0022}
 OWN_ERROR_DRIVE = 0.015
@@ -299,6 +305,11 @@ class HandRig(PlantRig):
             Nuisance(f"{REFERENCE_DELAY}@{t.name}", delay, REFERENCE_DELAY_SD, False, unit="s", apart=_APART)
             for t in strange
         ]
+        by_another_clock = dict.fromkeys(name for t in self.trials for name in t.options.get(MOVED, ()))
+        out += [
+            Nuisance(f"{SIGNAL_DELAY}{name}", 0.0, REFERENCE_DELAY_SD, False, unit="s")
+            for name in by_another_clock
+        ]
         return out
 
     def own_error(self, block: Block, model: Model) -> Array:
@@ -366,7 +377,10 @@ class HandRig(PlantRig):
     ) -> dict[str, Array]:
         """See PlantRig."""
         window = None if is_described(trial) else values.get(CURRENT_WINDOW)
-        return self.logged(self.run(model, values, trial, reference), trial, window)
+        signals = self.logged(self.run(model, values, trial, reference), trial, window)
+        for name in trial.options.get(MOVED, ()):
+            signals[name] = later(signals[name], values.get(SIGNAL_DELAY + name, 0.0) / trial.period)
+        return signals
 
     def logged(self, run: Rollout, trial: Trial, window: float | None = None) -> dict[str, Array]:
         """Signals as the hand's loggers show them: the current filtered, and rectified where it was."""

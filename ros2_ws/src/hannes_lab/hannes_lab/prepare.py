@@ -22,6 +22,7 @@ from .fit import fit
 from .grasp import with_seen_objects
 from .hand import HandRig
 from .join import Loaded, join_repeats, join_trials
+from .lags import with_one_clock
 from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig, check_parameters
 from .settle import settle
@@ -181,7 +182,7 @@ def prepare(
         trials = join_trials(check_trials(trials, (rig if isinstance(rig, type) else type(rig)).__name__))
     trials = [without_outliers(trial) for trial in trials]
     if rig is None:
-        trials = with_seen_objects(trials, model)
+        trials = with_seen_objects(with_one_clock(trials, model), model)
     rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
     check_parameters(rig, model)
     strange = not isinstance(rig, HandRig)
