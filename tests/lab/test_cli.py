@@ -215,3 +215,26 @@ def test_greedy_needs_two_conditions(
     words = ("diagnose", str(bags / "fast"), "--greedy", "--only", "cogging", "--jobs", "1")
     code, _, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
     assert code == 2 and "there is one condition only" in " ".join(err.split())
+
+
+def test_another_object_than_the_recording_says_is_taken_and_said(
+    bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("compare", str(bags), "--object", "grasp=none")
+    code, out, _ = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and "object is none, but the recording itself says rigid" in " ".join(out.split())
+    words = ("compare", str(bags), "--object", "grasp=rigid")
+    code, out, _ = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and "the recording itself says" not in " ".join(out.split())
+
+
+def test_what_was_not_looked_for_may_be_in_the_catalogue(
+    bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("diagnose", str(bags), "--only", "supply_sag", "--jobs", "1")
+    code, out, _ = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    said = " ".join(out.split())
+    assert code == 0 and said.startswith("UNKNOWN")
+    assert (
+        "is not one of those that were looked for (supply_sag)" in said and "not in the catalogue" not in said
+    )

@@ -288,6 +288,18 @@ def test_a_user_who_relaxes_and_pulls_again_grasps_at_one_place() -> None:
     )
 
 
+def test_a_grasp_that_is_denied_but_seen_is_said() -> None:
+    way, pull = [(0.0, 0.0), (1.2, 11.0), (2.6, 11.0), (3.6, 0.0)], [(0.0, 0.2), (2.6, 0.2), (3.0, -0.1)]
+    plain, free = (closing(name, way, pull) for name in ("ball", "free"))
+    time, position = plain.signals["encoder_position"]
+    pressed = {**plain.signals, "grip_force": (time, 15.0 * np.maximum(position - 8.0, 0.0))}
+    denied = [replace(t, options={"object": "none"}) for t in (replace(plain, signals=pressed), free)]
+    seen, nothing = with_seen_objects(denied, Model.load())
+    assert seen.options["object"] == "none" and nothing == denied[1]
+    (note,) = seen.notes
+    assert "as was said" in note and "from 8." in note and "--object ball=none" in note
+
+
 def test_an_encoder_that_is_logged_too_slowly_shows_no_grasp() -> None:
     way, pull = [(0.0, 0.0), (1.2, 11.0), (2.6, 11.0), (3.6, 0.0)], [(0.0, 0.2), (2.6, 0.2), (3.0, -0.1)]
     trial = closing("ball", way, pull)

@@ -1,6 +1,7 @@
 """The catalogue: every effect vanishes exactly, moves an output, and is the same function compiled and in Python."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from hannes_control.double_pid import DoublePID
 from hannes_control.reference import half_sine
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
-from hannes_sim.effect import Effect, EffectParameter, catalogue, evaluate, load_effect
+from hannes_sim.effect import Effect, EffectParameter, catalogue, effect_of, evaluate, load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.objects import OBJECTS
 from hannes_sim.ports import (
@@ -236,3 +237,33 @@ def test_no_strength_within_the_bounds_upsets_the_integration(name: str, grasp: 
         )
         apart = np.sqrt(np.mean((fine.motor_current - coarse.motor_current) ** 2))
         assert apart < 0.02, (factor, apart)
+
+
+@pytest.mark.parametrize(
+    ("effect", "drop", "add", "said"),
+    [
+        (
+            "load_dependent_friction",
+            "coefficient",
+            "coeficient",
+            "has no parameter coeficient and needs a value of c",
+        ),
+        ("stribeck_friction", "velocity", "", "needs a value of velocity"),
+        ("cogging", "sine", "", "needs a value of sine"),
+    ],
+)
+def test_an_effect_of_a_model_needs_its_own_parameters(effect: str, drop: str, add: str, said: str) -> None:
+    """A misspelt one would act with its typical value, and nobody would know."""
+    whole = load_effect(effect).entry()
+    parameters = {n: p for n, p in whole.parameters.items() if n != drop}
+    if add:
+        parameters[add] = whole.parameters[drop]
+    model = Model.load().with_effect(replace(whole, parameters=parameters))
+    with pytest.raises(HannesError, match=said):
+        make_plant(model)
+
+
+def test_a_refinement_of_an_effect_may_be_left_out_of_a_model() -> None:
+    whole = load_effect("cogging").entry()
+    plain = {n: p for n, p in whole.parameters.items() if "_" not in n}
+    assert len(plain) == 3 and effect_of(replace(whole, parameters=plain)) is load_effect("cogging")

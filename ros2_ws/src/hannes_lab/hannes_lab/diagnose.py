@@ -96,6 +96,8 @@ def diagnose(
         raise HannesError(
             "There is no effect to look for: those that were named are in the model already, or none was named."
         )
+    whole = set(catalogue()) <= {*sources, *(effect.name for effect in prepared.model.effects)}
+    only = () if whole else tuple(sources)
     usable = usable_effects(prepared, sources)
     sources = usable.sources
     prepared = replace(prepared, notes=(*prepared.notes, *usable.notes))
@@ -112,14 +114,14 @@ def diagnose(
     choice = (choose_greedily if greedy else choose)(search, null, limits, max_effects)
     answered = choice.adequate or choice.enough
     prepared = replace(prepared, problem=choice.search.problem)
-    falls = error_falls(prepared, choice.search, choice.best, in_order=greedy)
+    falls = error_falls(prepared, choice.search, choice.best, first=search, in_order=greedy)
     if answered and not greedy:
         choice, falls = without_idle(choice, falls)
-        null, instead = _named_instead(null, choice, search)
+        first, instead = _named_instead(choice, search)
         if instead is not choice:
-            choice = instead
+            choice, null = instead, first.null()
             prepared = replace(prepared, problem=choice.search.problem)
-            falls = error_falls(prepared, choice.search, choice.best)
+            falls = error_falls(prepared, choice.search, choice.best, first=first)
     search, best, limits = choice.search, choice.best, choice.limits
     bent = bent_sentence(choice, falls) if answered and not greedy else ""
     answered = answered and not bent
@@ -141,7 +143,7 @@ def diagnose(
     )
     return Diagnosis(
         verdict=verdict,
-        summary=summary(search, verdict, effects, tied, falls, limits, choice, best, bent),
+        summary=summary(search, verdict, effects, tied, falls, limits, choice, best, bent, only),
         effects=effects,
         tied=tied,
         experiments=experiments,
@@ -186,13 +188,13 @@ def _may_be_nought(search: Search, found: Candidate, limits: Chance) -> bool:
     )
 
 
-def _named_instead(null: Candidate, choice: Choice, search: Search) -> tuple[Candidate, Choice]:
+def _named_instead(choice: Choice, search: Search) -> tuple[Search, Choice]:
     """Name the effect that is the same thing as a parameter of the recordings which is far off in all that have it.
 
     Where little is known of a recording, a parameter of its own takes the effect over (the damping of an object that
     nobody described), and its prior charges less than an effect must gain.  So the parameter is put back to its nominal
     value, the effect in its place, and that is the answer where it explains all for less.  An effect adds to the
-    nominal value: only what is far above it counts.
+    nominal value: only what is far above it counts.  With the choice comes the search in which the nominal is fitted.
     """
     best = choice.best
     found: dict[str, list[tuple[float, float]]] = {}
@@ -202,11 +204,11 @@ def _named_instead(null: Candidate, choice: Choice, search: Search) -> tuple[Can
             found.setdefault(effect, []).append((float(z), c.value(float(z)) - c.value(0.0)))
     same = {effect: values for effect, values in found.items() if min(z for z, _ in values) > FAR}
     if not (same and choice.adequate):
-        return null, choice
+        return search, choice
     other = search.with_nuisances([n for n in search.nuisances if n.effect not in same])
-    bare, names = other.null(), (*best.names, *same)
+    names = (*best.names, *same)
     if is_adequate(other, other.from_point(best.names, best.fit.point), choice.limits):
-        return null, choice
+        return search, choice
     _, coordinates = other.with_effects(names)
     start = dict(best.fit.point)
     for effect, values in same.items():
@@ -215,13 +217,14 @@ def _named_instead(null: Candidate, choice: Choice, search: Search) -> tuple[Can
         start[own.name] = own.z(own.offset + float(np.mean([value for _, value in values])))
     instead = other.from_point(names, {c.name: start.get(c.name, 0.0) for c in coordinates})
     if instead.penalised > best.penalised:
-        return null, choice
+        return search, choice
+    other.null()  # from there the new search's nominal is fitted
     new = other.renewed(instead)
     (refitted,) = new.refitted([instead])
     again = new.polish(refitted)
     limits = chance(new.problem, again.fit, new.signatures(again))
     if not is_adequate(new, again, limits):
-        return null, choice
+        return search, choice
     held = ", ".join(n.name for n in search.nuisances if n.effect in same)
     note = (
         f"{held} would do the same, far outside what is usual (misfit, with what priors and parameters charge, "
@@ -230,7 +233,7 @@ def _named_instead(null: Candidate, choice: Choice, search: Search) -> tuple[Can
     made = replace(
         choice, search=new, best=again, limits=limits, rivals=(), notes=(*choice.notes, note), idle=""
     )
-    return bare, made
+    return other, made
 
 
 def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple[Fall, ...]]:
@@ -271,29 +274,25 @@ def _foretells(falls: Sequence[Fall]) -> bool:
 
 
 def fitted_model(model: Model, search: Search, best: Candidate, limits: Chance) -> Model:
-    """The model with fitted nuisance parameters and effects, as it goes into a file."""
+    """The model with fitted nuisance parameters and effects, as it goes into a file, and the effects' intervals."""
     values, names = best.fit.values, model.names
     known = {n: v for n, v in values.items() if "@" not in n and n in names}
     out = model.with_values(known, status="identified", source=FITTED)
     intervals = intervals_of(best.fit, limits)
     for name in best.names:
-        out = out.with_effect(_entry(search, name, values, intervals))
-    return replace(out, plant=model.plant)
+        out = out.with_effect(_entry(search, name, values))
+    spans = {
+        n: [float(f"{end:.5g}") for end in intervals[n]] for n in values if n.split(".")[0] in best.names
+    }
+    provenance = {**model.provenance, "intervals_95": spans} if spans else model.provenance
+    return replace(out, plant=model.plant, provenance=provenance)
 
 
-def _entry(
-    search: Search, name: str, values: Mapping[str, float], intervals: Mapping[str, tuple[float, float]]
-) -> EffectEntry:
+def _entry(search: Search, name: str, values: Mapping[str, float]) -> EffectEntry:
     kind = search.effect(name)
     own = {p.name: values[f"{name}.{p.name}"] for p in kind.parameters}
-    spans = {p.name: intervals[f"{name}.{p.name}"] for p in kind.parameters}
-    return kind.entry(
-        own,
-        source=effect_source(kind, search.sources[name]),
-        status="identified",
-        where="fitted by hannes; bounds are the 95 % interval",
-        intervals=spans,
-    )
+    source = effect_source(kind, search.sources[name])
+    return kind.entry(own, source=source, status="identified", where=FITTED)
 
 
 def intervals_of(found: Fit, limits: Chance) -> dict[str, tuple[float, float]]:

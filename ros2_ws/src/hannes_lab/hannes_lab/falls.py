@@ -28,10 +28,17 @@ NO_REPEATS = "There is one closure of each condition only: nothing could be held
 
 
 def error_falls(
-    prepared: Prepared, search: Search, best: Candidate, *, in_order: bool = False
+    prepared: Prepared,
+    search: Search,
+    best: Candidate,
+    *,
+    first: Search | None = None,
+    in_order: bool = False,
 ) -> tuple[Fall, ...]:
     """Nominal as given, nominal fitted, then the effects one after another in the order that helps most.
 
+    first      the search with the noise as the nominal model shows it: the nominal is fitted with that, whatever was
+               looked for and found.  A wrong model is fitted differently with other weights.  None: `search`
     in_order   take the effects in the order in which they stand
     """
     features = prepared.features
@@ -47,7 +54,7 @@ def error_falls(
             condition_error(features, [nominal]),
         )
     ]
-    steps: list[tuple[str, Candidate]] = [("nominal, fitted", search.null())]
+    steps: list[tuple[str, Candidate]] = []
     chain: tuple[str, ...] = ()
     left = list(best.names)
     while left:
@@ -58,8 +65,11 @@ def error_falls(
         pick = min(range(len(options)), key=lambda k: options[k].penalised)
         chain = (*chain, left[pick])
         steps.append((left.pop(pick), options[pick]))
-    held = search.each(_fall_in_worker, [(c, best.fit.values) for _, c in steps], "held-out error")
-    for (label, _), found in zip(steps, held, strict=True):
+    first = first or search
+    base = first.null()
+    held = [first.once(_fall_in_worker, base, base.fit.values, text="held-out error of the nominal")]
+    held += search.each(_fall_in_worker, [(c, best.fit.values) for _, c in steps], "held-out error")
+    for label, found in zip(("nominal, fitted", *(name for name, _ in steps)), held, strict=True):
         falls.append(Fall(label, *found))
     return tuple(falls)
 

@@ -78,12 +78,22 @@ def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
     for k, trial in enumerate(trials):
         given = trial.options.get("object")
         free = "object" not in trial.options or (isinstance(given, str) and given != "none")
-        if not free or ("object" in trial.options and "sensors" in trial.options):
+        denied = given == "none" and "sensors" not in trial.options
+        if not (free or denied) or ("object" in trial.options and "sensors" in trial.options):
             out.append(trial)
             continue
         seen = _felt(trial, model) or _seen(
             curves[k], [c for j, c in enumerate(curves) if j != k], _nominal(model)
         )
+        if denied:
+            if seen is not None:
+                note = (
+                    "nothing was grasped, as was said, though the closures look as if something was, from "
+                    f"{seen[1]:.1f} rad on: leave --object {trial.name}=none out if so"
+                )
+                trial = replace(trial, notes=(*trial.notes, note))
+            out.append(trial)
+            continue
         if seen is None:
             note = (
                 "no grasp is seen in the closures, so there was none; say --object CONDITION=soft (or rigid) if there "

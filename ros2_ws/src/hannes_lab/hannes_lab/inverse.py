@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
-from hannes_sim.effect import load_effect
+from hannes_sim.effect import effect_of
 from hannes_sim.ports import (
     CURRENT,
     DAMPING,
@@ -102,7 +102,7 @@ def _outputs(model: Model, get: Any, dt: float, q: Any, v: Any, force: Array) ->
     """What the effects add along a motion (n, N_OUTPUTS), their states stepped in its order."""
     out = np.zeros((q.size, N_OUTPUTS))
     for entry in model.effects:
-        kind = load_effect(entry.source or entry.name)
+        kind = effect_of(entry)
         p = np.array([get(f"{entry.name}.{parameter.name}") for parameter in kind.figures()])
         _along(_compiled(kind.contribute), p, np.zeros(max(1, kind.states)), dt, q, v, force, out)
     return out

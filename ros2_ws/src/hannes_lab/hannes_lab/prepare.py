@@ -120,12 +120,21 @@ def load_trials(
         for part in in_blocks(told_apart(trial)):
             said = [given[name] for name in (part.name, stem_of(str(bag)), trial.name) if name in given]
             if said:
-                part = replace(part, options={**part.options, "object": said[0]})
+                part = _with_said(part, said[0])
             loaded.append(Loaded(part, None if condition is None else str(condition), step))
     if not loaded:
         raise empty[0] if empty else HannesError("No bag was given.")
     first, *others = unique_names(join_repeats(loaded))
     return [replace(first, notes=(*first.notes, *(f"left out: {why}" for why in left_out))), *others]
+
+
+def _with_said(trial: Trial, given: str) -> Trial:
+    """The trial with the object that the user says, and a note where the recording says something else."""
+    there = trial.options.get("object")
+    other = there.get("name", "something else") if isinstance(there, Mapping) else there
+    note = f"it was said that its object is {given}, but the recording itself says {other}; taken as said"
+    notes = trial.notes if other in (None, given) else (*trial.notes, note)
+    return replace(trial, options={**trial.options, "object": given}, notes=notes)
 
 
 def read_trials(rig: type[PlantRig], paths: Sequence[Path]) -> list[Trial]:

@@ -29,6 +29,9 @@ CLOCK_PART = 0.25
 CLOCK_STEPS = 6
 """Length of the fit that tells it."""
 
+NAMED = 4
+"""Effects that a sentence names; of more, it says how many."""
+
 MANY_FAILURES = 0.05
 """Part of the simulations that did not stay finite from which on their parameters are worth a look."""
 
@@ -43,10 +46,12 @@ def summary(
     choice: Choice,
     best: Candidate,
     bent: str = "",
+    only: Sequence[str] = (),
 ) -> str:
     """The verdict in a sentence or two: what is missing, how the error falls, and what to be careful with.
 
     bent  why the set that chance explains is no answer, if it is none
+    only  the effects that were looked for, where those are not the whole catalogue
     """
     fall = fall_sentence(falls)
     far = _moved_far(best)
@@ -60,7 +65,8 @@ def summary(
         )
         other = choice.idle and f", though {choice.idle}"
         if not other and choice.adequate and choice.ranking:
-            other = ", and no effect of the catalogue gains more than chance would"
+            some = f"none of {_listed(only)}" if only else "no effect of the catalogue"
+            other = f", and {some} gains more than chance would"
         held = (
             f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability."
             if np.isfinite(falls[-1].held_out)
@@ -75,9 +81,17 @@ def summary(
             others = "; ".join(" + ".join(names_) for names_ in tied[1:])
             tie = f" With these data it ties with: {others}."
         return f"Missing: {names}. {fall}{tie}{far}"
-    part = f" The catalogue comes nearest with {names}, which is not enough." if names else ""
+    part = f" Nearest comes {names}, which is not enough." if names else ""
     why = bent or f"the best model's {shortfall(search, best, limits)}"
-    return f"Something is missing that is not in the catalogue: {why}.{part} {fall}"
+    beyond = (
+        f"is not one of those that were looked for ({_listed(only)})" if only else "is not in the catalogue"
+    )
+    return f"Something is missing that {beyond}: {why}.{part} {fall}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    """A few names, or how many there are."""
+    return ", ".join(names) if len(names) <= NAMED else f"{len(names)} effects"
 
 
 def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:

@@ -131,12 +131,8 @@ class Effect:
         source: str | None = None,
         status: str = "assumed",
         where: str = "typical value of the effect",
-        intervals: Mapping[str, tuple[float, float]] | None = None,
     ) -> EffectEntry:
-        """An entry for a model file; parameters that are not given take their typical value.
-
-        `intervals` (confidence intervals) become the entry's bounds, otherwise the effect's own bounds do.
-        """
+        """An entry for a model file; parameters that are not given take their typical value."""
         values = dict(values or {})
         unknown = sorted(set(values) - {p.name for p in cls.figures()})
         if unknown:
@@ -151,8 +147,7 @@ class Effect:
                 raise HannesError(
                     f"Effect '{cls.name}': {p.name} = {value} {p.unit} is outside [{p.lower}, {p.upper}]."
                 )
-            low, high = (intervals or {}).get(p.name, (p.lower, p.upper))
-            entries[p.name] = Parameter(value, p.unit, min(low, value), max(high, value), status, where)
+            entries[p.name] = Parameter(value, p.unit, p.lower, p.upper, status, where)
         return EffectEntry(cls.name, entries, source)
 
 
@@ -293,6 +288,24 @@ def _cacheable(effect: EffectType) -> bool:
     return effect.__module__.startswith("hannes_sim.")
 
 
+def effect_of(entry: EffectEntry) -> EffectType:
+    """The effect of a model's entry; HannesError where the entry lacks one of its parameters or has another.
+
+    A refinement (a part of a whole, or what has a usual value) may be left out: it is then what is typical.
+    """
+    kind = load_effect(entry.source or entry.name)
+    names, given = [p.name for p in kind.figures()], set(entry.parameters)
+    wrong = [f"has no parameter {n}" for n in sorted(given.difference(names))]
+    wrong += [
+        f"needs a value of {p.name}" for p in kind.figures() if p.name not in given and not (p.part or p.sd)
+    ]
+    if wrong:
+        raise HannesError(
+            f"Effect '{kind.name}' of the model {' and '.join(wrong)}; its parameters are {', '.join(names)}."
+        )
+    return kind
+
+
 class BoundEffects:
     """The active effects of a plant: their functions, parameters and states as flat buffers.
 
@@ -327,7 +340,7 @@ class BoundEffects:
 
     @classmethod
     def of(cls, entries: tuple[EffectEntry, ...]) -> BoundEffects:
-        return cls(tuple((load_effect(e.source or e.name), e.values) for e in entries))
+        return cls(tuple((effect_of(e), e.values) for e in entries))
 
 
 def evaluate(

@@ -31,7 +31,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import EffectEntry, Model
 from hannes_description.parameters import data_path, read_yaml
 from hannes_description.signals import SIGNALS, STIFFNESS_CLASSES
-from hannes_sim.effect import catalogue, load_effect, strength_of
+from hannes_sim.effect import catalogue, effect_of, strength_of
 from hannes_sim.factory import make_plant
 from hannes_sim.measurement import THESIS, Sensors
 from hannes_sim.objects import SOFT_BALL, GraspObject
@@ -328,7 +328,7 @@ def _with_hidden(model: Model, hidden: EffectEntry) -> Model:
     by a draw around the typical one could take away more than it hides."""
     own = next((e for e in model.effects if e.name == hidden.name), None)
     if own is not None:
-        kind = load_effect(own.source or own.name)
+        kind = effect_of(own)
         values = dict(own.values)
         for p in kind.parameters:
             if p.vanishing is not None:

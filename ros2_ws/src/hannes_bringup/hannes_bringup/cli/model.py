@@ -36,8 +36,11 @@ def show(
     """Show a model: every parameter with unit, bounds, status and source, and the effects that were added."""
     from hannes_description.model import Model
     from hannes_description.parameters import load_parameters
+    from hannes_sim.effect import effect_of
 
     loaded = Model.load(model)
+    for effect in loaded.effects:
+        effect_of(effect)
     base = load_parameters(loaded.base)
     parameters = {
         name: parameter
