@@ -69,6 +69,7 @@ class TargetProblem:
     predict: Callable[[Model, Mapping[str, float]], Mapping[str, float]]
     digest: str = ""
     simulations: int = 0
+    failures: int = 0
     failed: float = FAILED
 
     @property
@@ -80,12 +81,13 @@ class TargetProblem:
         return json.dumps([[t.name, t.value, t.sd] for t in self.targets]) + self.digest
 
     def residual(self, model: Model, values: Mapping[str, float]) -> Array:
-        """Residual (n,) in standard deviations; FAILED where the simulation diverges, 30 where a figure is missing."""
+        """Residual (n,) in standard deviations; `failed` where the simulation diverges, 30 where one is missing."""
         self.simulations += 1
         try:
             found = self.predict(model, values)
         except PlantDiverged:
-            return np.full(len(self.targets), FAILED)
+            self.failures += 1
+            return np.full(len(self.targets), self.failed)
         out = np.array([(t.value - found.get(t.name, math.nan)) / t.sd for t in self.targets])
         return np.where(np.isfinite(out), out, 30.0)
 
