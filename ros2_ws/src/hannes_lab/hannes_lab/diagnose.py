@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -109,25 +109,13 @@ def diagnose(
         executor=executor or Executor(jobs),
         progress=progress,
     )
-    null = search.null()
-    limits = chance(search.problem, null.fit, search.signatures(null))
-    choice = (choose_greedily if greedy else choose)(search, null, limits, max_effects)
-    answered = choice.adequate or choice.enough
-    prepared = replace(prepared, problem=choice.search.problem)
-    falls = error_falls(prepared, choice.search, choice.best, first=search, in_order=greedy)
-    if answered and not greedy:
-        choice, falls = without_idle(choice, falls)
-        first, instead = _named_instead(choice, search)
-        if instead is not choice:
-            choice, null = instead, first.null()
-            prepared = replace(prepared, problem=choice.search.problem)
-            falls = error_falls(prepared, choice.search, choice.best, first=first)
-    search, best, limits = choice.search, choice.best, choice.limits
-    bent = bent_sentence(choice, falls) if answered and not greedy else ""
-    answered = answered and not bent
-    if not answered:
+    answer = _answer(prepared, search, max_effects, greedy)
+    choice, falls, search = answer.choice, answer.falls, answer.choice.search
+    best, limits = choice.best, choice.limits
+    prepared = replace(prepared, problem=search.problem)
+    if not answer.holds:
         best, falls = worth_showing(search, best, falls)
-    verdict = "unknown" if not answered else "effects" if best.names else "nothing"
+    verdict = "unknown" if not answer.holds else "effects" if best.names else "nothing"
     tied = tied_sets(choice) if verdict == "effects" else ()
     best, left_out = search.with_spread(best), []
     while greedy and len(best.names) > 1 and (why := _idle_at_the_end(search, best, limits, falls)):
@@ -143,7 +131,7 @@ def diagnose(
     )
     return Diagnosis(
         verdict=verdict,
-        summary=summary(search, verdict, effects, tied, falls, limits, choice, best, bent, only),
+        summary=summary(search, verdict, effects, tied, falls, limits, choice, best, answer.bent, only),
         effects=effects,
         tied=tied,
         experiments=experiments,
@@ -153,7 +141,7 @@ def diagnose(
             prepared.features, prepared.features.closures(prepared.rig, best.fit.model, best.fit.values)
         ),
         chance=limits,
-        costs={"nominal_fitted": null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
+        costs={"nominal_fitted": answer.null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
         nuisances=_nuisance_table(best.fit, limits),
         notes=(
             *prepared.notes,
@@ -166,6 +154,42 @@ def diagnose(
         model=fitted_model(prepared.model, search, best, limits),
         values=best.fit.values,
     )
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """What a search came to.
+
+    null   the nominal model, fitted
+    bent   why what chance explains is no answer, if it is none
+    holds  whether the choice is an answer
+    """
+
+    null: Candidate
+    choice: Choice
+    falls: tuple[Fall, ...]
+    bent: str
+    holds: bool
+
+
+def _answer(prepared: Prepared, search: Search, max_effects: int, greedy: bool) -> _Answer:
+    """Choose the effects, hold out closures and conditions, and take back what that does not bear out."""
+    null = search.null()
+    limits = chance(search.problem, null.fit, search.signatures(null))
+    choice = (choose_greedily if greedy else choose)(search, null, limits, max_effects)
+
+    def falls_of(choice: Choice, first: Search) -> tuple[Fall, ...]:
+        there = replace(prepared, problem=choice.search.problem)
+        return error_falls(there, choice.search, choice.best, first=first, in_order=greedy)
+
+    falls, holds, bent = falls_of(choice, search), choice.adequate or choice.enough, ""
+    if holds and not greedy:
+        choice, falls = without_idle(choice, falls)
+        first, instead = _named_instead(choice, search)
+        if instead is not choice:
+            choice, null, falls = instead, first.null(), falls_of(instead, first)
+        bent = bent_sentence(choice, falls)
+    return _Answer(null, choice, falls, bent, holds and not bent)
 
 
 def _idle_at_the_end(search: Search, found: Candidate, limits: Chance, falls: Sequence[Fall]) -> str:
