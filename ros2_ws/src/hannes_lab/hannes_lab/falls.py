@@ -59,7 +59,7 @@ def error_falls(
     left = list(best.names)
     while left:
         options = [
-            search.found.get(key_of((*chain, name))) or search.add(search.found[key_of(chain)], name)
+            search.found.get(key_of((*chain, name))) or search.add(search.known(chain), name)
             for name in (left[:1] if in_order else left)
         ]
         pick = min(range(len(options)), key=lambda k: options[k].penalised)
@@ -110,7 +110,7 @@ def worth_showing(
     names = tuple(fall.added for fall in falls[2 : keep + 1])
     if len(names) == len(best.names):
         return best, falls
-    return search.found[key_of(names)], falls[: keep + 1]
+    return search.known(names), falls[: keep + 1]
 
 
 def fall_sentence(falls: Sequence[Fall]) -> str:

@@ -484,6 +484,10 @@ class Search:
         z, jacobian = larger.z[index], larger.jacobian[:, index]
         return replace(larger, model=model, coordinates=coordinates, z=z, jacobian=jacobian)
 
+    def known(self, names: Sequence[str]) -> Candidate:
+        """The fit of a set that was found; the model as it is is fitted if it was not yet."""
+        return self.found[key_of(names)] if names else self.null()
+
     def fitted(self, names: Names) -> Candidate:
         """The fit of a set: the known one, or one effect after the other."""
         found = self.null()
