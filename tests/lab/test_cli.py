@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 from hannes_description.model import Model
 from hannes_lab.cli import _relative_error
+from hannes_lab.cli_files import check_writable
 from hannes_lab.compare import MetricRow
 from hannes_lab.wording import failure_notes
 from hannes_sim.effect import load_effect
@@ -62,6 +63,10 @@ def test_diagnose_add_and_report(
     assert [e["name"] for e in content["effects"]] == ["glove_stiffness"]
     assert [e.name for e in Model.load(model).effects] == ["glove_stiffness"]
     assert "glove" in page.read_text(encoding="utf-8") and content["model_file"] == str(model)
+    # all is in the store now; the verdict is seen though its report fails
+    words = ("diagnose", str(bags), *only, "--jobs", "1", "--report", "/dev/full")
+    code, out, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 2 and out.startswith("EFFECTS") and "No space left" in err
     words = ("add", str(bags), "--effect", "glove_stiffness", "--out", str(tmp_path / "added.yaml"))
     code, _, _ = hannes(*words, "--jobs", "1", "--report", str(page), capsys=capsys, monkeypatch=monkeypatch)
     text = page.read_text(encoding="utf-8")
@@ -118,6 +123,19 @@ def test_hide_keeps_the_truth_away_from_the_bags(
         (("compare", "EMPTY"), "holds no bag"),
         (("hide", "OUT", "--truth", "T", "--effect", "wire_slack=much"), "wire_slack=much"),
         (("hide", "OUT", "--truth", "T", "--condition", "quick"), "slow"),
+        # files that cannot be written are named before anything is read
+        (("compare", "no/such/bag", "--report", "NOWHERE"), "The report cannot be written to"),
+        (("diagnose", "no/such/bag", "--report", "NOWHERE"), "Not a directory"),
+        (("diagnose", "no/such/bag", "--report", "EMPTY"), "it is a folder; name a file"),
+        (("diagnose", "no/such/bag", "--add", "--out", "NOWHERE.yaml"), "The model file cannot be written"),
+        (("add", "no/such/bag", "--effect", "cogging", "--out", "NOWHERE.yaml"), "The model file cannot"),
+        (("add", "no/such/bag", "--effect", "cogging", "--out", "mine.txt"), "a model file ends in .yaml"),
+        (("report", "no/such/bag", "--out", "NOWHERE"), "The report cannot be written to"),
+        (
+            ("calibrate", "no/such/bag", "--free", "motor.kt", "--out", "NOWHERE.yaml"),
+            "The model file cannot",
+        ),
+        (("hide", "OUT", "--truth", "NOWHERE"), "The truth cannot be written to"),
     ],
 )
 def test_a_mistake_gives_one_line_and_exit_code_2(
@@ -130,8 +148,11 @@ def test_a_mistake_gives_one_line_and_exit_code_2(
 ) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
+    (tmp_path / "file").touch()
     places = {
         "BAGS": str(bags),
+        "NOWHERE": str(tmp_path / "file" / "x"),
+        "NOWHERE.yaml": str(tmp_path / "file" / "x.yaml"),
         "EMPTY": str(empty),
         "OUT": str(tmp_path / "out"),
         "T": str(tmp_path / "t.yaml"),
@@ -140,6 +161,23 @@ def test_a_mistake_gives_one_line_and_exit_code_2(
     assert code == 2
     assert message in err and "Traceback" not in err
     assert len(err.strip().splitlines()) == 1
+
+
+def test_to_ask_whether_a_file_can_be_written_changes_nothing(tmp_path: Path) -> None:
+    there = tmp_path / "there.html"
+    there.write_text("mine", encoding="utf-8")
+    for path in (there, tmp_path / "new.html", tmp_path / "a" / "b" / "new.html", Path("/dev/stdout")):
+        check_writable(path, "The report")
+    assert [p.name for p in tmp_path.iterdir()] == ["there.html"] and there.read_text() == "mine"
+
+
+def test_the_answer_is_printed_though_the_report_cannot_be_written(
+    bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("compare", str(bags), "--report", "/dev/full")
+    code, out, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 2 and "times the repeatability" in out and "Report:" not in out
+    assert err == "hannes: The report cannot be written to '/dev/full': No space left on device.\n"
 
 
 @pytest.mark.parametrize(

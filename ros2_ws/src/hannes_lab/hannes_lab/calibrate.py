@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from .cache import code_hash, content_hash, default_folder
 from .cli import Scale, Topics, _command, _console, _number, _prepared, _print_json, _Progress
+from .cli_files import check_model_file
 from .errors import held_out_closures, overall, signal_errors
 from .executor import interruptible
 from .features import data_used
@@ -250,8 +251,7 @@ def command(
 ) -> None:
     """Identify named parameters of your hand from recorded closures, with intervals and warnings."""
     names = [n.strip() for n in free.split(",") if n.strip()]
-    if out.suffix not in (".yaml", ".yml"):
-        raise HannesError(f"--out {out}: a model file ends in .yaml.")
+    check_model_file(out)
     if not out.resolve().parent.is_dir():
         raise HannesError(f"--out {out}: the folder '{out.resolve().parent}' does not exist.")
     sds = {}
@@ -275,12 +275,21 @@ def command(
             cache=cache or default_folder("calibrate"),
             progress=progress,
         )
-    path = replace(
+    made = replace(
         found.model, name=out.stem, provenance={**dict(found.model.provenance), "command": _command()}
-    ).save(out)
-    if json:
-        _print_json(found.to_dict() | {"model_file": str(path)})
-        return
+    )
+    try:
+        if json:
+            _print_json(found.to_dict() | {"model_file": str(out)})
+        else:
+            _show(found)
+    finally:
+        made.save(out)
+    if not json:
+        typer.echo(f"Model file: {out}")
+
+
+def _show(found: Calibration) -> None:
     console = _console()
     for p in found.parameters:
         note = "" if p.identified else "   not identified"
@@ -297,4 +306,3 @@ def command(
     )
     for text in found.warnings:
         console.print(f"warning: {text}", style="dim", markup=False)
-    console.print(f"Model file: {path}")

@@ -26,6 +26,7 @@ from rich.table import Table
 from .add import Addition, add_effects, with_provenance
 from .cache import Store
 from .choose import MAX_EFFECTS, MAX_GREEDY
+from .cli_files import check_model_file, check_writable
 from .compare import Comparison, MetricRow
 from .compare import compare as compare_model
 from .diagnose import diagnose as diagnose_model
@@ -289,15 +290,18 @@ def compare(
     json: Json = False,
 ) -> None:
     """Compare the model with recorded closures: where does it fail, and by how much?"""
+    _check_files(report)
     prepared = _prepared(bags, model, objects, signals, rig, scale, _JOBS, topics)
     result = compare_model(prepared, fitted=fitted)
-    if report:
-        _write_report(report, comparison=result, after=None, diagnosis=None)
-    if json:
-        _print_json(result.to_dict())
-        return
-    _show_comparison(result)
-    _say_report(report)
+    try:
+        if json:
+            _print_json(result.to_dict())
+        else:
+            _show_comparison(result)
+    finally:  # whoever reads the answer may be gone
+        if report:
+            _write_report(report, comparison=result, after=None, diagnosis=None)
+    _say_files(json, report)
 
 
 def _show_comparison(result: Comparison) -> None:
@@ -380,6 +384,7 @@ def diagnose(
     json: Json = False,
 ) -> None:
     """Which physical effect does the model lack: nothing, effects of the catalogue, or something unknown?"""
+    _check_files(report, out if add else None)
     prepared = _prepared(bags, model, objects, signals, rig, scale, jobs, topics)
     _check_effects(prepared, [*(only or ()), *(effects or ())])
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
@@ -391,22 +396,20 @@ def diagnose(
             max_effects=max_effects,
             greedy=greedy,
         )
-    written = None
-    if add:
-        written = with_provenance(
-            replace(found.model, name=out.stem), prepared, found.falls, _command()
-        ).save(out)
-    if report:
-        _write_report(
-            report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
-        )
-    if json:
-        _print_json(found.to_dict() | {"model_file": str(written) if written else None})
-        return
-    _show_diagnosis(found, prepared.rig.machine)
-    if written:
-        typer.echo(f"Model file: {written}")
-    _say_report(report)
+    try:
+        if json:
+            _print_json(found.to_dict() | {"model_file": str(out) if add else None})
+        else:
+            _show_diagnosis(found, prepared.rig.machine)
+    finally:
+        if add:
+            named = replace(found.model, name=out.stem)
+            with_provenance(named, prepared, found.falls, _command()).save(out)
+        if report:
+            _write_report(
+                report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
+            )
+    _say_files(json, report, out if add else None)
 
 
 def _after(prepared: Prepared, found: Diagnosis | Addition) -> Comparison:
@@ -502,6 +505,7 @@ def add(
     json: Json = False,
 ) -> None:
     """Add effects to the model, fit them, and show the error fall on held-out data."""
+    _check_files(report, out)
     prepared = _prepared(bags, model, objects, signals, rig, scale, jobs, topics)
     _check_effects(prepared, effects or ())
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
@@ -511,16 +515,23 @@ def add(
             executor=executor,
             progress=progress,
         )
-    path = replace(
-        found.model, name=out.stem, provenance={**found.model.provenance, "command": _command()}
-    ).save(out)
-    if report:
-        _write_report(
-            report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
-        )
-    if json:
-        _print_json(found.to_dict() | {"model_file": str(path)})
-        return
+    try:
+        if json:
+            _print_json(found.to_dict() | {"model_file": str(out)})
+        else:
+            _show_addition(found, prepared.rig.machine)
+    finally:
+        replace(
+            found.model, name=out.stem, provenance={**found.model.provenance, "command": _command()}
+        ).save(out)
+        if report:
+            _write_report(
+                report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
+            )
+    _say_files(json, report, out)
+
+
+def _show_addition(found: Addition, machine: str) -> None:
     console = _console()
     for effect in found.effects:
         values = ", ".join(
@@ -528,9 +539,7 @@ def add(
             for n, p in effect.parameters.items()
         )
         console.print(f"[bold]{effect.title}[/bold]: {values}")
-    _show_falls(console, found, prepared.rig.machine)
-    console.print(f"Model file: {path}")
-    _say_report(report)
+    _show_falls(console, found, machine)
 
 
 def hide(
@@ -562,6 +571,7 @@ def hide(
     """Make a measurement set with a hidden effect, to test the lab or to learn what an effect looks like."""
     from .hide import DEFAULT_CONDITIONS, make_set, write_set
 
+    check_writable(truth, "The truth")
     wanted: dict[str, float] = {}
     for text in effects or ():
         name, _, factor = text.partition("=")
@@ -628,6 +638,7 @@ def report(
     json: Json = False,
 ) -> None:
     """Compare, diagnose and add, all on one self-contained HTML page."""
+    _check_files(out)
     prepared = _prepared(bags, model, objects, signals, rig, scale, jobs, topics)
     _check_effects(prepared, effects or ())
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
@@ -639,12 +650,14 @@ def report(
             max_effects=max_effects,
             greedy=greedy,
         )
-    _write_report(out, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found)
-    if json:
-        _print_json({"report": str(out), "verdict": found.verdict})
-        return
-    typer.echo(found.summary)
-    _say_report(out)
+    try:
+        if json:
+            _print_json({"report": str(out), "verdict": found.verdict})
+        else:
+            typer.echo(found.summary)
+    finally:
+        _write_report(out, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found)
+    _say_files(json, out)
 
 
 def _write_report(
@@ -665,6 +678,17 @@ def _write_report(
         write_report(path, **parts, command=_command())
 
 
-def _say_report(path: Path | None) -> None:
-    if path:
-        typer.echo(f"Report: {path.resolve()}")
+def _check_files(report: Path | None, model_file: Path | None = None) -> None:
+    """Refuse files that cannot be written, before the work begins."""
+    if report is not None:
+        check_writable(report, "The report")
+    if model_file is not None:
+        check_model_file(model_file)
+
+
+def _say_files(json: bool, report: Path | None, model_file: Path | None = None) -> None:
+    """Where the files are that were written; with --json the output is the answer alone."""
+    if model_file and not json:
+        typer.echo(f"Model file: {model_file}")
+    if report and not json:
+        typer.echo(f"Report: {report.resolve()}")
