@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -178,6 +179,20 @@ def test_the_answer_is_printed_though_the_report_cannot_be_written(
     code, out, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
     assert code == 2 and "times the repeatability" in out and "Report:" not in out
     assert err == "hannes: The report cannot be written to '/dev/full': No space left on device.\n"
+
+
+@pytest.mark.parametrize("words", [(), ("--json",)], ids=["text", "json"])
+def test_a_full_output_is_one_line_and_a_reader_that_has_gone_none(
+    words: tuple[str, ...], bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdout", open("/dev/full", "w"))
+    code, _, err = hannes("compare", str(bags), *words, capsys=capsys, monkeypatch=monkeypatch)
+    assert (code, err) == (1, "hannes: the output cannot be written: No space left on device.\n")
+    reader, writer = os.pipe()
+    os.close(reader)
+    monkeypatch.setattr("sys.stdout", os.fdopen(writer, "w"))
+    code, _, err = hannes("compare", str(bags), *words, capsys=capsys, monkeypatch=monkeypatch)
+    assert (code, err) == (141, "")
 
 
 @pytest.mark.parametrize(
