@@ -181,11 +181,20 @@ def test_the_answer_is_printed_though_the_report_cannot_be_written(
     assert err == "hannes: The report cannot be written to '/dev/full': No space left on device.\n"
 
 
+def test_a_note_on_no_condition_has_no_name_of_one(
+    bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("compare", str(bags), str(bags / "slow"), "--json")
+    code, out, _ = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    said = f"left out: '{bags / 'slow'}' is the same recording as '{bags / 'slow'}'"
+    assert code == 0 and said in json.loads(out)["notes"]
+
+
 @pytest.mark.parametrize("words", [(), ("--json",)], ids=["text", "json"])
 def test_a_full_output_is_one_line_and_a_reader_that_has_gone_none(
     words: tuple[str, ...], bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sys.stdout", open("/dev/full", "w"))
+    monkeypatch.setattr("sys.stdout", os.fdopen(os.open("/dev/full", os.O_WRONLY), "w"))
     code, _, err = hannes("compare", str(bags), *words, capsys=capsys, monkeypatch=monkeypatch)
     assert (code, err) == (1, "hannes: the output cannot be written: No space left on device.\n")
     reader, writer = os.pipe()

@@ -26,12 +26,22 @@ from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig, check_parameters
 from .settle import settle
 from .surrogate import rig_for
-from .trials import SIGNALS, Closure, NoClosure, Trial, compared, curves_of, stem_of, trial_of, unique_names
+from .trials import (
+    SIGNALS,
+    Closure,
+    NoClosure,
+    OfAll,
+    Trial,
+    compared,
+    curves_of,
+    stem_of,
+    trial_of,
+    unique_names,
+)
 from .units import in_si
 
 OUTLIER = 6.0
 """A closure whose distance from the median closure exceeds this multiple of the median distance is left out."""
-
 
 DRIFT = 1e-4
 """Chance of a trend below which closures are said to drift."""
@@ -124,7 +134,7 @@ def load_trials(
     if not loaded:
         raise empty[0] if empty else HannesError("No bag was given.")
     first, *others = unique_names(join_repeats(loaded))
-    return [replace(first, notes=(*first.notes, *(f"left out: {why}" for why in left_out))), *others]
+    return [replace(first, notes=(*first.notes, *(OfAll(f"left out: {why}") for why in left_out))), *others]
 
 
 def read_trials(rig: type[PlantRig], paths: Sequence[Path]) -> list[Trial]:
@@ -234,12 +244,18 @@ def prepare(
 
 
 def notes_of(trials: Sequence[Trial]) -> list[str]:
-    """What is to be said of the recordings; what is said of several of them stands once, with all their names."""
+    """What is to be said of the recordings; what is said of several of them stands once, with all their names.
+
+    What is of no recording alone stands without the name of the one that carries it.
+    """
     of: dict[str, list[str]] = {}
     for trial in trials:
         for note in trial.notes:
             of.setdefault(note, []).append(trial.name)
-    return [f"{', '.join(dict.fromkeys(names))}: {note}" for note, names in of.items()]
+    return [
+        str(note) if isinstance(note, OfAll) else f"{', '.join(dict.fromkeys(names))}: {note}"
+        for note, names in of.items()
+    ]
 
 
 def drifts(features: Features, machine: str = "hand") -> list[str]:
