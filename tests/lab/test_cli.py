@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ from hannes_lab.cli_files import check_writable
 from hannes_lab.compare import MetricRow
 from hannes_lab.wording import failure_notes
 from hannes_sim.effect import load_effect
-from lab.foreign_bags import hannes
+from lab.foreign_bags import hannes, hannes_in_one_line, signals_of_set, write_set
 
 
 @pytest.fixture(scope="module")
@@ -179,6 +180,36 @@ def test_the_answer_is_printed_though_the_report_cannot_be_written(
     code, out, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
     assert code == 2 and "times the repeatability" in out and "Report:" not in out
     assert err == "hannes: The report cannot be written to '/dev/full': No space left on device.\n"
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One closure of each of two conditions."""
+    folder = tmp_path_factory.mktemp("single")
+    return write_set(folder / "bags", signals_of_set(closures=1))
+
+
+def test_one_closure_of_each_condition_is_compared_in_the_signals_units(
+    single: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, out, _ = hannes_in_one_line("compare", str(single), capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and re.search(r"Overall error: [\d.]+ rad \(encoder_position\), [\d.]+ A", out)
+    assert "No condition was repeated: there is no repeatability to hold the error against." in out
+    assert "one closure of fast, slow: how well it repeats is not known" in out
+    assert "the repeatability is a guess" not in out
+
+
+def test_effects_are_added_to_one_closure_of_each_condition_in_the_signals_units(
+    single: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("add", str(single), "--effect", "load_dependent_friction", "--jobs", "1", "--no-cache")
+    out_file = ("--out", str(tmp_path / "mine.yaml"), "--report", str(tmp_path / "mine.html"))
+    code, out, _ = hannes_in_one_line(*words, *out_file, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and "Error on conditions that were left out of the fit" in out
+    assert "repeatability" not in out and " - " not in out
+    assert re.search(r"coefficient = [\d.e-]+ \(", out), "a number without a dimension has no unit"
+    page = (tmp_path / "mine.html").read_text(encoding="utf-8")
+    assert "No condition was repeated" in page and "nothing could be held out" not in page
 
 
 def test_a_note_on_no_condition_has_no_name_of_one(

@@ -50,6 +50,7 @@ def make_comparison(*, off: float = 0.3, condition: str = "slow", closures: int 
         "model": {"name": "nominal", "sha256": "ab" * 32},
         "fitted": True,
         "overall": ratio_of(off),
+        "by_signal": {"encoder_position": off},
         "errors": [
             {
                 "condition": condition,
@@ -363,6 +364,21 @@ def test_an_effect_that_is_found_within_chance_has_its_share() -> None:
     assert "the effect that was found gains more than chance does" in page.words and "99.9" in page.words
 
 
+def test_the_ranking_says_how_many_of_the_effects_are_shown() -> None:
+    diagnosis = make_diagnosis("effects")
+    assert "the others are folded" not in page_of(diagnosis=diagnosis).words
+    diagnosis["ranking"] += [{"names": [f"effect_{k}"], "cost": 1e4, "explained": 0.0} for k in range(9)]
+    words = page_of(diagnosis=diagnosis).words
+    assert "The 8 that explain most; the 3 others are folded below them." in words
+    assert "The 3 others" in words
+
+
+def test_repeatability_is_said_as_it_is_computed() -> None:
+    words = page_of(diagnosis=make_diagnosis("effects")).words.replace("\u00a0", " ")
+    assert "root mean square of the closures around their own mean (n − 1 in the denominator)" in words
+    assert "another closure of the same kind" not in words
+
+
 def test_experiments_that_separate_nothing_are_called_so() -> None:
     diagnosis = make_diagnosis("effects")
     diagnosis["experiments"][0]["distance"] = 0.1
@@ -411,7 +427,25 @@ def test_one_closure_shows_dashes_and_errors_in_units() -> None:
     assert "without repeated closures there is no scale" in page.words
     assert "1 closure of slow" in page.words
     assert "0.30 rad" in page.words.replace("\u00a0", " ")
-    assert "– × repeatability" in page.words
+    assert "× repeatability" not in page.words and "±2" not in page.words
+    assert "0.300 rad error of encoder position" in page.words.replace("\u00a0", " ")
+
+
+@pytest.mark.parametrize("held", [True, False], ids=["two conditions", "one"])
+def test_where_nothing_was_repeated_the_error_falls_in_the_signals_units(held: bool) -> None:
+    diagnosis = make_diagnosis("effects")
+    for fall, rmse in zip(diagnosis["falls"], (0.5, 0.4, 0.25), strict=True):
+        fall |= {"train": NAN, "held_out": NAN, "by_condition": {"slow": NAN} if held else {}}
+        fall["signals"][0] |= {"rmse": rmse / 2, "repeatability": NAN, "ratio": NAN}
+        fall["held_out_signals"] = {"encoder_position": rmse} if held else {}
+    single = {"comparison": make_comparison(closures=1), "after": make_comparison(closures=1, off=0.1)}
+    page = page_of(**single, diagnosis=diagnosis)
+    words = page.words.replace("\u00a0", " ")
+    where = "on conditions that were left out of the fit" if held else "of the fit"
+    was, now = ("0.400", "0.250") if held else ("0.200", "0.125")
+    assert f"{was} → {now} rad error of encoder position {where}; before: nominal, fitted" in words
+    assert "No condition was repeated: there is no repeatability to hold the error against." in words
+    assert "+ glove stiffness" in words and "× repeatability" not in words and "– →" not in words
 
 
 def test_overlays_of_the_same_condition_keep_their_counterparts() -> None:
@@ -610,6 +644,7 @@ def test_picture_as_svg_is_the_same_every_time(tmp_path: Path) -> None:
         (plus_minus(5.0, NAN), "5.00"),
         (unit("kg.m2"), "kg·m²"),
         (unit("N.m/rad3"), "N·m/rad³"),
+        (unit("1"), ""),
     ],
 )
 def test_numbers(made: str, text: str) -> None:

@@ -16,7 +16,7 @@ from hannes_description.errors import HannesError
 from numpy.typing import NDArray
 
 from .cache import code_hash, content_hash, default_folder
-from .cli import Scale, Topics, _command, _console, _number, _prepared, _print_json, _Progress
+from .cli import Scale, Topics, _command, _console, _number, _prepared, _print_json, _Progress, _with_unit
 from .cli_files import check_model_file
 from .errors import held_out_closures, overall, signal_errors
 from .executor import interruptible
@@ -184,7 +184,7 @@ def _notes_of_errors(errors: Mapping[str, float], best: Fit, held: Sequence[str]
     out = []
     if not math.isfinite(after):
         out.append(
-            "One closure of each condition: there is no repeatability and no held-out closure to judge the model by."
+            "No condition was repeated: there is no repeatability and no held-out closure to judge the model by."
         )
     elif after > LARGE_MISFIT:
         rest = (
@@ -294,15 +294,16 @@ def _show(found: Calibration) -> None:
     for p in found.parameters:
         note = "" if p.identified else "   not identified"
         console.print(
-            f"{p.name} = {_number(p.value)} {p.unit}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
+            f"{p.name} = {_with_unit(p.value, p.unit)}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
         )
     console.print(
         f"{found.agree} of {len(found.costs)} starts agree; {found.simulations} simulations, "
         f"{found.from_cache} from the cache."
     )
-    console.print(
-        "Error in multiples of the repeatability: "
-        + ", ".join(f"{k.replace('_', ' ')} {_number(v, 3)}" for k, v in found.errors.items())
-    )
+    if any(map(math.isfinite, found.errors.values())):
+        console.print(
+            "Error in multiples of the repeatability: "
+            + ", ".join(f"{k.replace('_', ' ')} {_number(v, 3)}" for k, v in found.errors.items())
+        )
     for text in found.warnings:
         console.print(f"warning: {text}", style="dim", markup=False)

@@ -34,6 +34,7 @@ from .diagnose import effect_sources
 from .diagnosis import Diagnosis
 from .executor import Executor, interruptible
 from .experiments import VISIBLE, Experiment
+from .falls import NO_REPEATS, errors_in_units
 from .own_effect import check_own_effects
 from .prepare import Prepared, load_trials, prepare, read_trials
 from .rig import load_rig
@@ -262,6 +263,11 @@ def _number(value: float, digits: int = 4) -> str:
     return f"{value:.{digits}g}" if math.isfinite(value) else "-"
 
 
+def _with_unit(value: float, unit: str, digits: int = 4) -> str:
+    """A number with its unit; one without a dimension alone."""
+    return _number(value, digits) if unit in ("", "1") else f"{_number(value, digits)} {unit}"
+
+
 def _console() -> Console:
     return Console(width=None if sys.stdout.isatty() else 110, highlight=False)
 
@@ -314,7 +320,7 @@ def _show_comparison(result: Comparison) -> None:
             c.condition,
             c.signal,
             c.phase,
-            f"{_number(c.rmse, 3)} {c.unit}",
+            _with_unit(c.rmse, c.unit, 3),
             _number(c.bias, 3),
             _number(c.repeatability, 3),
             _number(c.ratio, 3),
@@ -332,7 +338,7 @@ def _show_comparison(result: Comparison) -> None:
         table.add_row(
             m.condition,
             m.name,
-            f"{_number(m.measured)} {m.unit}",
+            _with_unit(m.measured, m.unit),
             _number(m.sd, 2),
             _number(m.model),
             _relative_error(m),
@@ -347,7 +353,9 @@ def _show_comparison(result: Comparison) -> None:
     if math.isfinite(result.overall):
         console.print(f"Overall error: {_number(result.overall)} times the repeatability between closures.")
     else:
-        console.print("Overall error: not known in repeatabilities, for no condition was repeated.")
+        units = {e.signal: e.unit for e in result.errors}
+        each = ", ".join(f"{_with_unit(v, units[s], 3)} ({s})" for s, v in result.by_signal.items())
+        console.print(f"Overall error: {each}. {NO_REPEATS}")
     for note in result.notes:
         console.print(f"note: {note}", style="dim")
 
@@ -424,7 +432,7 @@ def _show_diagnosis(found: Diagnosis, machine: str) -> None:
         for name, p in effect.parameters.items():
             note = "" if p.identified else "   not identified by these data"
             console.print(
-                f"  {name} = {_number(p.value)} {p.unit}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
+                f"  {name} = {_with_unit(p.value, p.unit)}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
             )
         console.print(f"  {effect.why}")
     _show_falls(console, found, machine)
@@ -456,17 +464,21 @@ _LISTED = 3
 
 
 def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> None:
+    units = {s.signal: s.unit for fall in found.falls for s in fall.signals}
+    if not math.isfinite(found.falls[-1].held_out):
+        _show_falls_in_units(console, found, units)
+        return
     table = Table(
         title=f"Error, in multiples of the repeatability between closures (1 = as good as the {machine} repeats)"
     )
-    units = {s.signal: s.unit for fall in found.falls for s in fall.signals}
     signals = list(found.falls[-1].held_out_signals)
     table.add_column("model", no_wrap=True)
     for name in ("training\nclosures", "held-out\nclosures"):
         table.add_column(name, justify="right")
     table.add_column("held-out\nconditions", overflow="fold")
     for signal in signals:
-        table.add_column(f"{signal.replace('_', chr(10), 1)}, {units.get(signal, '')}", justify="right")
+        unit = "" if units[signal] == "1" else f", {units[signal]}"
+        table.add_column(signal.replace("_", "\n", 1) + unit, justify="right")
     for k, fall in enumerate(found.falls):
         if len(fall.by_condition) > _LISTED:
             worst = max(fall.by_condition, key=fall.by_condition.__getitem__)
@@ -485,6 +497,21 @@ def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> 
     console.print(table)
     if signals:
         console.print("The last columns: error of each signal on held-out conditions.", style="dim")
+
+
+def _show_falls_in_units(console: Console, found: Diagnosis | Addition, units: dict[str, str]) -> None:
+    """The table where nothing was repeated: there is no repeatability to give the errors in."""
+    held, steps = errors_in_units(found.falls)
+    table = Table(title="Error on conditions that were left out of the fit" if held else "Error of the fit")
+    table.add_column("model", no_wrap=True)
+    for signal in steps[-1]:
+        unit = "" if units[signal] == "1" else f", {units[signal]}"
+        table.add_column(signal.replace("_", "\n", 1) + unit, justify="right")
+    for k, (fall, errors) in enumerate(zip(found.falls, steps, strict=True)):
+        table.add_row(
+            ("+ " if k > 1 else "") + fall.added, *(_number(errors.get(s, math.nan), 3) for s in steps[-1])
+        )
+    console.print(table)
 
 
 @interruptible
@@ -535,7 +562,7 @@ def _show_addition(found: Addition, machine: str) -> None:
     console = _console()
     for effect in found.effects:
         values = ", ".join(
-            f"{n} = {_number(p.value)} {p.unit} ({_number(p.low, 3)} .. {_number(p.high, 3)})"
+            f"{n} = {_with_unit(p.value, p.unit)} ({_number(p.low, 3)} .. {_number(p.high, 3)})"
             for n, p in effect.parameters.items()
         )
         console.print(f"[bold]{effect.title}[/bold]: {values}")

@@ -46,6 +46,9 @@ OUTLIER = 6.0
 DRIFT = 1e-4
 """Chance of a trend below which closures are said to drift."""
 
+FEW = 5
+"""Closures of a condition below which its scatter is no more than guessed, and no test is made (compare.py)."""
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -235,10 +238,18 @@ def prepare(
         if len(where) < len(trials):
             notes.append(f"{signal} is recorded only in {', '.join(where)}")
     notes += drifts(features, rig.machine)
-    few = [c for c in features.conditions if all(b.n < 5 for b in features.blocks if b.condition == c)]
+    most = {c: max(b.n for b in features.blocks if b.condition == c) for c in features.conditions}
+    single = [c for c, n in most.items() if n == 1]
+    if single:
+        notes.append(
+            f"one closure of {', '.join(single)}: how well it repeats is not known, and what the fit takes for scatter "
+            "is a guess from the priors"
+        )
+    few = [c for c, n in most.items() if 1 < n < FEW]
     if few:
         notes.append(
-            f"fewer than five closures of {', '.join(few)}: the repeatability is a guess from the priors"
+            f"fewer than five closures of {', '.join(few)}: what the fit takes for scatter is a guess from the priors "
+            "in part, and no error is called beyond chance"
         )
     return Prepared(rig, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))
 
