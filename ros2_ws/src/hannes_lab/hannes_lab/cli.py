@@ -567,6 +567,8 @@ def _show_addition(found: Addition, machine: str) -> None:
         )
         console.print(f"[bold]{effect.title}[/bold]: {values}")
     _show_falls(console, found, machine)
+    for note in found.notes:
+        console.print(f"note: {note}", style="dim")
 
 
 def hide(

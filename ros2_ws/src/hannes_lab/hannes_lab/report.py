@@ -23,6 +23,7 @@ from markupsafe import Markup
 
 from . import report_text as text
 from .experiments import VISIBLE
+from .report_next import SHOWN, how_sure, next_step, runner_up
 from .report_svg import curve_svg, overlay_svg, tick_text
 
 Part = Mapping[str, Any]
@@ -42,6 +43,12 @@ FIGURES = 3
 
 RANKS = 8
 """Rows of the ranking that are open at first."""
+
+NOTES = 5
+"""Notes that are open at first."""
+
+LONG_NOTE, NOTE = 260, 150
+"""Characters from which a note is folded, and of its beginning that stays open."""
 
 PACKAGES = ("hannes_lab", "hannes_sim", "mujoco", "numba", "numpy", "scipy")
 
@@ -122,6 +129,8 @@ def render_report(
         fixed=lambda v, n=2: text.DASH if text.known(v) is None else text.fixed(v, n),
     )
     sources = [part for part in (diagnosis, comparison) if part is not None]
+    verdict, found, ranks = verdict_of(comparison, after, diagnosis), effects(diagnosis), ranking(diagnosis)
+    kind = str(diagnosis.get("verdict", "")) if diagnosis is not None else "comparison"
     context = {
         "title": title,
         "command": command,
@@ -130,23 +139,27 @@ def render_report(
         "before_name": before_name,
         "after_name": after_name,
         "both": after is not None,
-        "verdict": verdict_of(comparison, after, diagnosis),
+        "verdict": verdict,
+        "sure": how_sure(found),
+        "more_effects": max(0, len(found) - SHOWN),
+        "runner_up": runner_up(ranks, diagnosis) if kind in ("effects", "unknown") else None,
+        "next": next_step(kind, diagnosis, command),
         "fall": error_fall(diagnosis),
         "conditions": overlay_groups(comparison, after),
         "repeated": any(text.known(e.get("repeatability")) is not None for e in _list(comparison, "errors")),
         "maps": failure_maps(comparison, after),
         "dependences": dependences(comparison, after, diagnosis),
-        "effects": effects(diagnosis),
+        "effects": found,
         "tied": tied(diagnosis),
         "experiments": _list(diagnosis, "experiments"),
         "separable": any(
             (text.known(x.get("distance")) or 0.0) >= VISIBLE for x in _list(diagnosis, "experiments")
         ),
-        "ranking": ranking(diagnosis),
+        "ranking": ranks,
         "metrics": metric_groups(comparison, after),
         "nuisances": nuisances(diagnosis),
         "data": _list(sources[0], "data") or _list(sources[-1], "data"),
-        "notes": list(dict.fromkeys(str(n) for part in (*sources, after) for n in _list(part, "notes"))),
+        "notes": notes([*sources, after]),
         "models": _models(comparison, after, diagnosis),
         "json": Markup(embedded_json(data)),
         "scripts": {name: Markup(body) for name, body in scripts.items()},
@@ -155,6 +168,20 @@ def render_report(
         "uplot_licence": _asset("uPlot.LICENSE"),
     }
     return environment.get_template("report.html.j2").render(context)
+
+
+def notes(parts: Sequence[Part | None]) -> dict[str, list[dict[str, str]]]:
+    """Every note once, in the words of the command line: what is open at first, and what is folded.
+
+    Of a long note the beginning is open.
+    """
+    texts = list(dict.fromkeys(str(n) for part in parts for n in _list(part, "notes")))
+    rows = [
+        {"text": note, "short": text.shortened(note, NOTE) if len(note) > LONG_NOTE else ""} for note in texts
+    ]
+    # one that would be folded alone stands with the others
+    shown = len(rows) if len(rows) <= NOTES + 1 else NOTES
+    return {"first": rows[:shown], "rest": rows[shown:]}
 
 
 def embedded_json(data: Any) -> str:
@@ -679,21 +706,23 @@ def _model_names(comparison: Part | None, after: Part | None, diagnosis: Part | 
 
 
 def _models(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> list[dict[str, str]]:
+    """The models with what was added to each; one row for those that are the same."""
+    added = "".join(f" + {e.get('name', '')}" for e in _list(diagnosis, "effects"))
     rows = [
-        ("before" if after is not None else "compared", comparison),
-        ("after", after),
-        ("diagnosed", diagnosis),
+        ("before" if after is not None else "compared", comparison, ""),
+        ("after", after, added),
+        ("diagnosed", diagnosis, added),
     ]
-    out = [
-        {
-            "role": role,
-            "name": str((part.get("model") or {}).get("name", "")),
-            "sha256": str((part.get("model") or {}).get("sha256", "")),
-        }
-        for role, part in rows
-        if part is not None
-    ]
-    return [m for m in out if m["name"] or m["sha256"]]
+    out: list[dict[str, str]] = []
+    for role, part, more in rows:
+        model = (part or {}).get("model") or {}
+        name, sha256 = str(model.get("name", "")), str(model.get("sha256", ""))
+        same = next((m for m in out if sha256 and m["sha256"] == sha256), None)
+        if same is not None:
+            same["role"] += f", {role}"
+        elif name or sha256:
+            out.append({"role": role, "name": name + more, "sha256": sha256})
+    return out
 
 
 def _unit_of(signal: str, *parts: Part | None) -> str:

@@ -136,6 +136,11 @@ def words(name: Any) -> str:
     return str(name).replace("_", " ")
 
 
+def shortened(sentence: str, most: int) -> str:
+    """The beginning of a sentence, whole words of at most so many characters, with dots where it goes on."""
+    return sentence if len(sentence) <= most else f"{sentence[:most].rsplit(None, 1)[0].rstrip(',;:')} …"
+
+
 def listed(texts: Sequence[str], last: str = "and") -> str:
     """a, b and c."""
     if len(texts) < 2:
