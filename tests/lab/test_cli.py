@@ -2,16 +2,20 @@
 
 import json
 import math
+import os
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from hannes_description.model import Model
 from hannes_lab.cli import _relative_error
+from hannes_lab.cli_files import check_writable
 from hannes_lab.compare import MetricRow
 from hannes_lab.wording import failure_notes
 from hannes_sim.effect import load_effect
-from lab.foreign_bags import hannes
+from lab.foreign_bags import hannes, hannes_in_one_line, signals_of_set, write_bag, write_set
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +66,10 @@ def test_diagnose_add_and_report(
     assert [e["name"] for e in content["effects"]] == ["glove_stiffness"]
     assert [e.name for e in Model.load(model).effects] == ["glove_stiffness"]
     assert "glove" in page.read_text(encoding="utf-8") and content["model_file"] == str(model)
+    # all is in the store now; the verdict is seen though its report fails
+    words = ("diagnose", str(bags), *only, "--jobs", "1", "--report", "/dev/full")
+    code, out, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 2 and out.startswith("EFFECTS") and "No space left" in err
     words = ("add", str(bags), "--effect", "glove_stiffness", "--out", str(tmp_path / "added.yaml"))
     code, _, _ = hannes(*words, "--jobs", "1", "--report", str(page), capsys=capsys, monkeypatch=monkeypatch)
     text = page.read_text(encoding="utf-8")
@@ -110,6 +118,15 @@ def test_hide_keeps_the_truth_away_from_the_bags(
     [
         (("compare", "no/such/bag"), "does not exist"),
         (("diagnose", "BAGS", "--effect", "wire_slak"), "Unknown effect"),
+        (("diagnose", "BAGS", "--only", "glove_stifness"), "did you mean glove_stiffness?"),
+        (("compare", "EMPTY", "--rig", "EMPS"), "is a folder: give the path of DATA_EMPS.mat in it"),
+        (("compare", "BROKEN"), "while parsing a flow sequence in"),
+        (
+            ("compare", "SILENT"),
+            "no topics but those that were read: /hannes/motor/state as encoder_position",
+        ),
+        (("diagnose", "BAGS", "--effect", "bad.py:Good"), "(line 3, in Bad)"),
+        (("diagnose", "BAGS", "--effect", "nameless.py:Nameless"), "nameless.py, class Nameless: the effect"),
         (("diagnose", "BAGS", "--model", "nothing"), "No model"),
         (("diagnose", "BAGS", "--dask", "foo"), "tcp://HOST:8786"),
         (("add", "BAGS", "--effect", "mine.py:Mine"), "No file"),
@@ -118,6 +135,19 @@ def test_hide_keeps_the_truth_away_from_the_bags(
         (("compare", "EMPTY"), "holds no bag"),
         (("hide", "OUT", "--truth", "T", "--effect", "wire_slack=much"), "wire_slack=much"),
         (("hide", "OUT", "--truth", "T", "--condition", "quick"), "slow"),
+        # files that cannot be written are named before anything is read
+        (("compare", "no/such/bag", "--report", "NOWHERE"), "The report cannot be written to"),
+        (("diagnose", "no/such/bag", "--report", "NOWHERE"), "Not a directory"),
+        (("diagnose", "no/such/bag", "--report", "EMPTY"), "it is a folder; name a file"),
+        (("diagnose", "no/such/bag", "--add", "--out", "NOWHERE.yaml"), "The model file cannot be written"),
+        (("add", "no/such/bag", "--effect", "cogging", "--out", "NOWHERE.yaml"), "The model file cannot"),
+        (("add", "no/such/bag", "--effect", "cogging", "--out", "mine.txt"), "a model file ends in .yaml"),
+        (("report", "no/such/bag", "--out", "NOWHERE"), "The report cannot be written to"),
+        (
+            ("calibrate", "no/such/bag", "--free", "motor.kt", "--out", "NOWHERE.yaml"),
+            "The model file cannot",
+        ),
+        (("hide", "OUT", "--truth", "NOWHERE"), "The truth cannot be written to"),
     ],
 )
 def test_a_mistake_gives_one_line_and_exit_code_2(
@@ -130,8 +160,24 @@ def test_a_mistake_gives_one_line_and_exit_code_2(
 ) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
+    (tmp_path / "file").touch()
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "metadata.yaml").write_text("a: [1, 2\n   b: }", encoding="utf-8")
+    signals = {"encoder_position": (np.arange(9.0), np.arange(9.0))}
+    write_bag(tmp_path / "silent", signals)
+    imported = "from hannes_sim.effect import Effect, EffectParameter\n"
+    bad = "class Bad(Effect):\n    parameters = (EffectParameter('a', 'N', 2.0, 1.0, 3.0),)\n"
+    (tmp_path / "bad.py").write_text(imported + bad, encoding="utf-8")
+    (tmp_path / "nameless.py").write_text(imported + "class Nameless(Effect):\n    pass\n", encoding="utf-8")
     places = {
         "BAGS": str(bags),
+        "BROKEN": str(tmp_path / "broken"),
+        "SILENT": str(tmp_path / "silent"),
+        "EMPS": f"{Path(__file__).parents[2] / 'examples' / 'emps' / 'emps.py'}:Emps",
+        "bad.py:Good": f"{tmp_path / 'bad.py'}:Good",
+        "nameless.py:Nameless": f"{tmp_path / 'nameless.py'}:Nameless",
+        "NOWHERE": str(tmp_path / "file" / "x"),
+        "NOWHERE.yaml": str(tmp_path / "file" / "x.yaml"),
         "EMPTY": str(empty),
         "OUT": str(tmp_path / "out"),
         "T": str(tmp_path / "t.yaml"),
@@ -139,7 +185,77 @@ def test_a_mistake_gives_one_line_and_exit_code_2(
     code, _, err = hannes(*(places.get(word, word) for word in words), capsys=capsys, monkeypatch=monkeypatch)
     assert code == 2
     assert message in err and "Traceback" not in err
-    assert len(err.strip().splitlines()) == 1
+    assert len(err.strip().splitlines()) == 1 and "  " not in err
+
+
+def test_to_ask_whether_a_file_can_be_written_changes_nothing(tmp_path: Path) -> None:
+    there = tmp_path / "there.html"
+    there.write_text("mine", encoding="utf-8")
+    for path in (there, tmp_path / "new.html", tmp_path / "a" / "b" / "new.html", Path("/dev/stdout")):
+        check_writable(path, "The report")
+    assert [p.name for p in tmp_path.iterdir()] == ["there.html"] and there.read_text() == "mine"
+
+
+def test_the_answer_is_printed_though_the_report_cannot_be_written(
+    bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("compare", str(bags), "--report", "/dev/full")
+    code, out, err = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 2 and "times the repeatability" in out and "Report:" not in out
+    assert err == "hannes: The report cannot be written to '/dev/full': No space left on device.\n"
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One closure of each of two conditions."""
+    folder = tmp_path_factory.mktemp("single")
+    return write_set(folder / "bags", signals_of_set(closures=1))
+
+
+def test_one_closure_of_each_condition_is_compared_in_the_signals_units(
+    single: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, out, _ = hannes_in_one_line("compare", str(single), capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and re.search(r"Overall error: [\d.]+ rad \(encoder_position\), [\d.]+ A", out)
+    assert "No condition was repeated: there is no repeatability to hold the error against." in out
+    assert "one closure of fast, slow: how well it repeats is not known" in out
+    assert "the repeatability is a guess" not in out
+
+
+def test_effects_are_added_to_one_closure_of_each_condition_in_the_signals_units(
+    single: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("add", str(single), "--effect", "load_dependent_friction", "--jobs", "1", "--no-cache")
+    out_file = ("--out", str(tmp_path / "mine.yaml"), "--report", str(tmp_path / "mine.html"))
+    code, out, _ = hannes_in_one_line(*words, *out_file, capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and "Error on conditions that were left out of the fit" in out
+    assert "repeatability" not in out and " - " not in out
+    assert re.search(r"coefficient = [\d.e-]+ \(", out), "a number without a dimension has no unit"
+    page = (tmp_path / "mine.html").read_text(encoding="utf-8")
+    assert "No condition was repeated" in page and "nothing could be held out" not in page
+
+
+def test_a_note_on_no_condition_has_no_name_of_one(
+    bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("compare", str(bags), str(bags / "slow"), "--json")
+    code, out, _ = hannes(*words, capsys=capsys, monkeypatch=monkeypatch)
+    said = f"left out: '{bags / 'slow'}' is the same recording as '{bags / 'slow'}'"
+    assert code == 0 and said in json.loads(out)["notes"]
+
+
+@pytest.mark.parametrize("words", [(), ("--json",)], ids=["text", "json"])
+def test_a_full_output_is_one_line_and_a_reader_that_has_gone_none(
+    words: tuple[str, ...], bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdout", os.fdopen(os.open("/dev/full", os.O_WRONLY), "w"))
+    code, _, err = hannes("compare", str(bags), *words, capsys=capsys, monkeypatch=monkeypatch)
+    assert (code, err) == (1, "hannes: the output cannot be written: No space left on device.\n")
+    reader, writer = os.pipe()
+    os.close(reader)
+    monkeypatch.setattr("sys.stdout", os.fdopen(writer, "w"))
+    code, _, err = hannes("compare", str(bags), *words, capsys=capsys, monkeypatch=monkeypatch)
+    assert (code, err) == (141, "")
 
 
 @pytest.mark.parametrize(

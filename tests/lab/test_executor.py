@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -204,22 +204,38 @@ def run_hannes(words: list[str], cache: Path, **options: object) -> "subprocess.
     )
 
 
+def ended_in_the_first_round(words: list[str], cache: Path, end: Callable[[int], None]) -> tuple[int, str]:
+    """Exit code and standard error of a command that `end` is called for, with its id, once results are kept."""
+    process = run_hannes(words, cache)
+    kept = cache / "hannes" / "lab"
+    begun = 3  # the nominal fit and what chance reaches: far from the end, also on a busy machine
+    while process.poll() is None and (not kept.exists() or len(list(kept.glob("*.npz"))) < begun):
+        time.sleep(0.02)
+    end(process.pid)
+    out, err = process.communicate()
+    assert out == ""
+    return process.returncode, err
+
+
+@pytest.mark.parametrize("kill", [os.kill, os.killpg], ids=["alone", "with its workers"])
+def test_sigterm_ends_a_run_as_ctrl_c_does(
+    kill: Callable[[int, int], None], recordings: Path, tmp_path: Path
+) -> None:
+    words = ["diagnose", str(recordings), "--max-effects", "1", "--json", "--jobs", "2"]
+    code, err = ended_in_the_first_round(words, tmp_path, lambda process: kill(process, signal.SIGTERM))
+    said = "hannes: terminated; what was found is kept: the same command goes on from there"
+    assert (code, err.strip().splitlines()) == (143, [said])
+
+
 def test_ctrl_c_in_the_first_round_and_the_same_command_goes_on(
     recordings: Path, serial: Diagnosis, tmp_path: Path
 ) -> None:
     only = [word for name in ONLY for word in ("--only", name)]
     words = ["diagnose", str(recordings), *only, "--max-effects", "1", "--json", "--jobs", "2"]
-    process = run_hannes(words, tmp_path)
-    kept = tmp_path / "hannes" / "lab"
-    begun = 3  # the nominal fit and what chance reaches: far from the end, also on a busy machine
-    while process.poll() is None and (not kept.exists() or len(list(kept.glob("*.npz"))) < begun):
-        time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGINT)  # what Ctrl-C does: to the workers as well
-    out, err = process.communicate()
-    assert process.returncode == 130 and out == ""
-    assert err.strip().splitlines() == [
-        "hannes: interrupted; what was found is kept: the same command goes on from there"
-    ]
+    # what Ctrl-C does: to the workers as well
+    code, err = ended_in_the_first_round(words, tmp_path, lambda process: os.killpg(process, signal.SIGINT))
+    said = "hannes: interrupted; what was found is kept: the same command goes on from there"
+    assert (code, err.strip().splitlines()) == (130, [said])
 
     again = run_hannes(words, tmp_path)
     out, err = again.communicate()

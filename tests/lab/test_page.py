@@ -505,4 +505,9 @@ async def look(browser: Browser, link: str) -> str:
     while not any(address.endswith("report.html") for address in browser.addresses):
         browser.find("1")
         await asyncio.sleep(0.05)
+    # it is as tall as what it shows: only the page around it scrolls
+    whole = (
+        "document.querySelector('iframe.report').clientHeight > 2000 && document.documentElement.scrollHeight"
+    )
+    assert await browser.until(whole) > 2000
     return str(browser.find("document.querySelector('main').innerText"))

@@ -15,6 +15,7 @@ import pytest
 from hannes_description.errors import HannesError
 from hannes_lab.pictures import write_picture
 from hannes_lab.report import embedded_json, render_report, write_report
+from hannes_lab.report_next import next_step
 from hannes_lab.report_text import interval, number, percent, plus_minus, ratio, signed_percent, unit
 
 NAN = math.nan
@@ -50,6 +51,7 @@ def make_comparison(*, off: float = 0.3, condition: str = "slow", closures: int 
         "model": {"name": "nominal", "sha256": "ab" * 32},
         "fitted": True,
         "overall": ratio_of(off),
+        "by_signal": {"encoder_position": off},
         "errors": [
             {
                 "condition": condition,
@@ -349,6 +351,77 @@ def test_what_the_page_shows_of_an_effect() -> None:
         assert target[1:] in page.ids
 
 
+def card_of(page_words: str) -> str:
+    """The verdict's card: what stands before the notes."""
+    return page_words.split("What to know of this answer")[0].replace("\u00a0", " ")
+
+
+def test_the_card_says_how_sure_what_else_and_what_next() -> None:
+    diagnosis = make_diagnosis("effects")
+    card = card_of(page_of(diagnosis=diagnosis).words)
+    assert "glove stiffness: stiffness 1.774 (95 % interval 1.717 … 1.832) × 10⁻³ N·m/rad" in card
+    assert "Ties glove stiffness or gravity: they fit equally well" in card
+    assert "Runner-up" not in card, "gravity is tied"
+    assert "hannes record --profile half_sine --option period=1.5 --object none" in card
+    diagnosis["tied"] = []
+    card = card_of(page_of(diagnosis=diagnosis).words)
+    assert (
+        "Runner-up gravity alone explains 41.0 % of the excess misfit (glove stiffness: 99.9 %)" in card
+        and "Ties" not in card
+    )
+    many = {**diagnosis, "effects": [make_effect(f"effect_{k}") for k in range(6)]}
+    card = card_of(page_of(diagnosis=many).words)
+    assert "effect 3: stiffness" in card and "effect 4: stiffness" not in card and "2 more" in card
+
+
+@pytest.mark.parametrize(
+    ("verdict", "command", "then"),
+    [
+        ("effects", "hannes diagnose b --report r.html", "hannes diagnose b --report r.html --add"),
+        ("effects", "hannes report b --out r.html", "hannes diagnose b --report r.html --add"),
+        ("effects", "hannes diagnose b --add", "hannes run graph --model my_hand.yaml"),
+        ("effects", "hannes diagnose b --add --out a.yaml", "hannes run graph --model a.yaml"),
+        ("effects", "hannes diagnose b --add --rig r.py:R", None),
+        ("added", "hannes add b --effect x --out=b.yaml", "hannes run graph --model b.yaml"),
+        ("unknown", "hannes diagnose b", "hannes diagnose b --effect my_effect.py:MyEffect"),
+        ("nothing", "hannes diagnose b", None),
+        ("comparison", "hannes compare b --fitted --report r.html", "hannes diagnose b"),
+        ("effects", "something else", None),
+        ("effects", "hannes diagnose 'b", None),
+    ],
+)
+def test_what_to_run_next(verdict: str, command: str, then: str | None) -> None:
+    step = next_step(verdict, None, command)
+    assert (step and step["command"]) == then
+
+
+def test_ties_that_nothing_separates_give_no_command() -> None:
+    diagnosis = make_diagnosis("effects")
+    diagnosis["experiments"][0]["distance"] = 0.1
+    step = next_step("effects", diagnosis, "hannes diagnose b")
+    assert step is not None and not step["command"] and "No experiment" in step["text"]
+
+
+def test_notes_come_after_the_verdict_long_ones_folded() -> None:
+    long = "a sentence that goes on " * 20
+    diagnosis = make_diagnosis("effects") | {"notes": [long, *(f"note {k}" for k in range(9))]}
+    page = page_of(comparison=make_comparison(), diagnosis=diagnosis)
+    before = page.words.split("How the error falls")[0]
+    assert "What to know of this answer a sentence that goes on" in before
+    assert " ".join(long.split()) in before and "note 8" in before and "6 more" in before
+    assert page.words.count("there is one condition only") == 1
+    assert (
+        sum(t == "details" for t, _ in page.elements[: page.elements.index(("section", {"id": "fall"}))]) == 2
+    )
+
+
+def test_models_are_told_apart_by_name() -> None:
+    after = make_comparison(off=0.05) | {"model": {"name": "nominal", "sha256": "ef" * 32}}
+    words = page_of(comparison=make_comparison(), after=after, diagnosis=make_diagnosis("effects")).words
+    assert f"before nominal sha256 {'ab' * 32}" in words
+    assert f"after, diagnosed nominal + glove_stiffness sha256 {'ef' * 32}" in words
+
+
 def test_no_excess_is_not_shared_out() -> None:
     page = page_of(comparison=None, diagnosis=make_diagnosis("nothing"))
     assert "There is no excess to explain" in page.words
@@ -361,6 +434,21 @@ def test_an_effect_that_is_found_within_chance_has_its_share() -> None:
     page = page_of(comparison=None, diagnosis=diagnosis)
     assert "There is no excess to explain" not in page.words
     assert "the effect that was found gains more than chance does" in page.words and "99.9" in page.words
+
+
+def test_the_ranking_says_how_many_of_the_effects_are_shown() -> None:
+    diagnosis = make_diagnosis("effects")
+    assert "the others are folded" not in page_of(diagnosis=diagnosis).words
+    diagnosis["ranking"] += [{"names": [f"effect_{k}"], "cost": 1e4, "explained": 0.0} for k in range(9)]
+    words = page_of(diagnosis=diagnosis).words
+    assert "The 8 that explain most; the 3 others are folded below them." in words
+    assert "The 3 others" in words
+
+
+def test_repeatability_is_said_as_it_is_computed() -> None:
+    words = page_of(diagnosis=make_diagnosis("effects")).words.replace("\u00a0", " ")
+    assert "root mean square of the closures around their own mean (n − 1 in the denominator)" in words
+    assert "another closure of the same kind" not in words
 
 
 def test_experiments_that_separate_nothing_are_called_so() -> None:
@@ -411,7 +499,25 @@ def test_one_closure_shows_dashes_and_errors_in_units() -> None:
     assert "without repeated closures there is no scale" in page.words
     assert "1 closure of slow" in page.words
     assert "0.30 rad" in page.words.replace("\u00a0", " ")
-    assert "– × repeatability" in page.words
+    assert "× repeatability" not in page.words and "±2" not in page.words
+    assert "0.300 rad error of encoder position" in page.words.replace("\u00a0", " ")
+
+
+@pytest.mark.parametrize("held", [True, False], ids=["two conditions", "one"])
+def test_where_nothing_was_repeated_the_error_falls_in_the_signals_units(held: bool) -> None:
+    diagnosis = make_diagnosis("effects")
+    for fall, rmse in zip(diagnosis["falls"], (0.5, 0.4, 0.25), strict=True):
+        fall |= {"train": NAN, "held_out": NAN, "by_condition": {"slow": NAN} if held else {}}
+        fall["signals"][0] |= {"rmse": rmse / 2, "repeatability": NAN, "ratio": NAN}
+        fall["held_out_signals"] = {"encoder_position": rmse} if held else {}
+    single = {"comparison": make_comparison(closures=1), "after": make_comparison(closures=1, off=0.1)}
+    page = page_of(**single, diagnosis=diagnosis)
+    words = page.words.replace("\u00a0", " ")
+    where = "on conditions that were left out of the fit" if held else "of the fit"
+    was, now = ("0.400", "0.250") if held else ("0.200", "0.125")
+    assert f"{was} → {now} rad error of encoder position {where}; before: nominal, fitted" in words
+    assert "No condition was repeated: there is no repeatability to hold the error against." in words
+    assert "+ glove stiffness" in words and "× repeatability" not in words and "– →" not in words
 
 
 def test_overlays_of_the_same_condition_keep_their_counterparts() -> None:
@@ -610,6 +716,7 @@ def test_picture_as_svg_is_the_same_every_time(tmp_path: Path) -> None:
         (plus_minus(5.0, NAN), "5.00"),
         (unit("kg.m2"), "kg·m²"),
         (unit("N.m/rad3"), "N·m/rad³"),
+        (unit("1"), ""),
     ],
 )
 def test_numbers(made: str, text: str) -> None:

@@ -6,8 +6,10 @@ import json
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hannes_bringup.cli import COMMANDS, Command, build_app, load
 from hannes_bringup.cli.run import NODES
@@ -165,3 +167,17 @@ while True:
     assert topic["type"] == "std_msgs/msg/Float64"
     assert (topic["publishers"], topic["subscribers"]) == (1, 0)
     assert topic["messages"] > 10 and 50 < topic["rate"] < 150 and topic["age"] < 0.5
+
+
+def test_the_demo_says_what_was_noticed_in_a_bag_in_a_line(tmp_path: Path) -> None:
+    from bags.bag_samples import foreign_bag, motor_messages
+    from hannes_bringup.cli.demo import _read
+
+    stamps = np.arange(1, 301, dtype=np.int64) * 1_000_000
+    stamps = np.concatenate([stamps[:5], stamps[4:]])
+    bag = foreign_bag(tmp_path / "bag", motor_messages(stamps, np.arange(stamps.size) * 1_000_000))
+    said: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _read(bag, said.append)
+    assert len(said) == 1 and "Messages that repeat the one before, its stamp too, were left out" in said[0]

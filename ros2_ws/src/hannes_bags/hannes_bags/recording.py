@@ -206,8 +206,15 @@ class Recording:
 
     def elsewhere(self) -> str:
         """How to say that a signal was recorded under another topic, and which topics of the bag were not read."""
-        unread = ", ".join(f"{n} ({t})" for n, t in self.metadata.get("bag", {}).get("unread", {}).items())
-        others = f"not read were {unread}" if unread else "the bag has no other topic"
+        bag = self.metadata.get("bag", {})
+        unread = ", ".join(f"{n} ({t})" for n, t in bag.get("unread", {}).items())
+        read = ", ".join(f"{topic} as {name}" for name, topic in bag.get("topics", {}).items())
+        if unread:
+            others = f"not read were {unread}"
+        elif read:
+            others = f"the bag has no topics but those that were read: {read}"
+        else:
+            others = "the bag has no other topic"
         return f"If it was recorded under another topic, name that with {HOW_TO_NAME}; {others}."
 
     def slice(self, t0: float, t1: float) -> Recording:

@@ -206,7 +206,7 @@ def load_metadata(path: Path) -> dict[str, Any]:
         LookupError,
     ) as error:
         reason = (
-            "it is nested too deeply" if isinstance(error, RecursionError) else str(error).replace("\n", " ")
+            "it is nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())
         )
         raise HannesError(f"{path} is not readable YAML: {reason}. {recover_hint(path.parent)}") from None
     information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None

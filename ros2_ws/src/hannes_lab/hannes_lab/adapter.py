@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from .features import Features, kind_of, stands_for_all
 from .rig import REFERENCE_SIZES, PlantRig, Rig
-from .trials import EARLY, Closure, NoClosure, Part, Trial, has_gap, left_out, unique_names
+from .trials import EARLY, Closure, NoClosure, OfAll, Part, Trial, has_gap, left_out, unique_names
 from .units import AGAINST, ENCODER, FOLLOWS, STANDS, follows
 
 Array = NDArray[np.float64]
@@ -113,7 +113,7 @@ def check_trials(found: object, rig: str) -> list[Trial]:
         try:
             kept.append(_checked(trial, f"{rig}, trial '{trial.name}'"))
         except NoClosure as none:
-            without.append(f"left out: {none}")
+            without.append(OfAll(f"left out: {none}"))
     if not kept:
         raise NoClosure(without[0].removeprefix("left out: "))
     return unique_names([replace(kept[0], notes=(*kept[0].notes, *without)), *kept[1:]], conditions=False)

@@ -16,7 +16,8 @@ from hannes_description.errors import HannesError
 from numpy.typing import NDArray
 
 from .cache import code_hash, content_hash, default_folder
-from .cli import Scale, Topics, _command, _console, _number, _prepared, _print_json, _Progress
+from .cli import Scale, Topics, _command, _console, _number, _prepared, _print_json, _Progress, _with_unit
+from .cli_files import check_model_file
 from .errors import held_out_closures, overall, signal_errors
 from .executor import interruptible
 from .features import data_used
@@ -183,7 +184,7 @@ def _notes_of_errors(errors: Mapping[str, float], best: Fit, held: Sequence[str]
     out = []
     if not math.isfinite(after):
         out.append(
-            "One closure of each condition: there is no repeatability and no held-out closure to judge the model by."
+            "No condition was repeated: there is no repeatability and no held-out closure to judge the model by."
         )
     elif after > LARGE_MISFIT:
         rest = (
@@ -250,8 +251,7 @@ def command(
 ) -> None:
     """Identify named parameters of your hand from recorded closures, with intervals and warnings."""
     names = [n.strip() for n in free.split(",") if n.strip()]
-    if out.suffix not in (".yaml", ".yml"):
-        raise HannesError(f"--out {out}: a model file ends in .yaml.")
+    check_model_file(out)
     if not out.resolve().parent.is_dir():
         raise HannesError(f"--out {out}: the folder '{out.resolve().parent}' does not exist.")
     sds = {}
@@ -275,26 +275,35 @@ def command(
             cache=cache or default_folder("calibrate"),
             progress=progress,
         )
-    path = replace(
+    made = replace(
         found.model, name=out.stem, provenance={**dict(found.model.provenance), "command": _command()}
-    ).save(out)
-    if json:
-        _print_json(found.to_dict() | {"model_file": str(path)})
-        return
+    )
+    try:
+        if json:
+            _print_json(found.to_dict() | {"model_file": str(out)})
+        else:
+            _show(found)
+    finally:
+        made.save(out)
+    if not json:
+        typer.echo(f"Model file: {out}")
+
+
+def _show(found: Calibration) -> None:
     console = _console()
     for p in found.parameters:
         note = "" if p.identified else "   not identified"
         console.print(
-            f"{p.name} = {_number(p.value)} {p.unit}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
+            f"{p.name} = {_with_unit(p.value, p.unit)}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
         )
     console.print(
         f"{found.agree} of {len(found.costs)} starts agree; {found.simulations} simulations, "
         f"{found.from_cache} from the cache."
     )
-    console.print(
-        "Error in multiples of the repeatability: "
-        + ", ".join(f"{k.replace('_', ' ')} {_number(v, 3)}" for k, v in found.errors.items())
-    )
+    if any(map(math.isfinite, found.errors.values())):
+        console.print(
+            "Error in multiples of the repeatability: "
+            + ", ".join(f"{k.replace('_', ' ')} {_number(v, 3)}" for k, v in found.errors.items())
+        )
     for text in found.warnings:
         console.print(f"warning: {text}", style="dim", markup=False)
-    console.print(f"Model file: {path}")

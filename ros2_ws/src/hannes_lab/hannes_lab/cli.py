@@ -26,6 +26,7 @@ from rich.table import Table
 from .add import Addition, add_effects, with_provenance
 from .cache import Store
 from .choose import MAX_EFFECTS, MAX_GREEDY
+from .cli_files import check_model_file, check_writable
 from .compare import Comparison, MetricRow
 from .compare import compare as compare_model
 from .diagnose import diagnose as diagnose_model
@@ -33,6 +34,7 @@ from .diagnose import effect_sources
 from .diagnosis import Diagnosis
 from .executor import Executor, interruptible
 from .experiments import VISIBLE, Experiment
+from .falls import NO_REPEATS, errors_in_units
 from .own_effect import check_own_effects
 from .prepare import Prepared, load_trials, prepare, read_trials
 from .rig import load_rig
@@ -261,6 +263,11 @@ def _number(value: float, digits: int = 4) -> str:
     return f"{value:.{digits}g}" if math.isfinite(value) else "-"
 
 
+def _with_unit(value: float, unit: str, digits: int = 4) -> str:
+    """A number with its unit; one without a dimension alone."""
+    return _number(value, digits) if unit in ("", "1") else f"{_number(value, digits)} {unit}"
+
+
 def _console() -> Console:
     return Console(width=None if sys.stdout.isatty() else 110, highlight=False)
 
@@ -289,15 +296,18 @@ def compare(
     json: Json = False,
 ) -> None:
     """Compare the model with recorded closures: where does it fail, and by how much?"""
+    _check_files(report)
     prepared = _prepared(bags, model, objects, signals, rig, scale, _JOBS, topics)
     result = compare_model(prepared, fitted=fitted)
-    if report:
-        _write_report(report, comparison=result, after=None, diagnosis=None)
-    if json:
-        _print_json(result.to_dict())
-        return
-    _show_comparison(result)
-    _say_report(report)
+    try:
+        if json:
+            _print_json(result.to_dict())
+        else:
+            _show_comparison(result)
+    finally:  # whoever reads the answer may be gone
+        if report:
+            _write_report(report, comparison=result, after=None, diagnosis=None)
+    _say_files(json, report)
 
 
 def _show_comparison(result: Comparison) -> None:
@@ -310,7 +320,7 @@ def _show_comparison(result: Comparison) -> None:
             c.condition,
             c.signal,
             c.phase,
-            f"{_number(c.rmse, 3)} {c.unit}",
+            _with_unit(c.rmse, c.unit, 3),
             _number(c.bias, 3),
             _number(c.repeatability, 3),
             _number(c.ratio, 3),
@@ -328,7 +338,7 @@ def _show_comparison(result: Comparison) -> None:
         table.add_row(
             m.condition,
             m.name,
-            f"{_number(m.measured)} {m.unit}",
+            _with_unit(m.measured, m.unit),
             _number(m.sd, 2),
             _number(m.model),
             _relative_error(m),
@@ -343,7 +353,9 @@ def _show_comparison(result: Comparison) -> None:
     if math.isfinite(result.overall):
         console.print(f"Overall error: {_number(result.overall)} times the repeatability between closures.")
     else:
-        console.print("Overall error: not known in repeatabilities, for no condition was repeated.")
+        units = {e.signal: e.unit for e in result.errors}
+        each = ", ".join(f"{_with_unit(v, units[s], 3)} ({s})" for s, v in result.by_signal.items())
+        console.print(f"Overall error: {each}. {NO_REPEATS}")
     for note in result.notes:
         console.print(f"note: {note}", style="dim")
 
@@ -380,6 +392,7 @@ def diagnose(
     json: Json = False,
 ) -> None:
     """Which physical effect does the model lack: nothing, effects of the catalogue, or something unknown?"""
+    _check_files(report, out if add else None)
     prepared = _prepared(bags, model, objects, signals, rig, scale, jobs, topics)
     _check_effects(prepared, [*(only or ()), *(effects or ())])
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
@@ -391,22 +404,20 @@ def diagnose(
             max_effects=max_effects,
             greedy=greedy,
         )
-    written = None
-    if add:
-        written = with_provenance(
-            replace(found.model, name=out.stem), prepared, found.falls, _command()
-        ).save(out)
-    if report:
-        _write_report(
-            report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
-        )
-    if json:
-        _print_json(found.to_dict() | {"model_file": str(written) if written else None})
-        return
-    _show_diagnosis(found, prepared.rig.machine)
-    if written:
-        typer.echo(f"Model file: {written}")
-    _say_report(report)
+    try:
+        if json:
+            _print_json(found.to_dict() | {"model_file": str(out) if add else None})
+        else:
+            _show_diagnosis(found, prepared.rig.machine)
+    finally:
+        if add:
+            named = replace(found.model, name=out.stem)
+            with_provenance(named, prepared, found.falls, _command()).save(out)
+        if report:
+            _write_report(
+                report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
+            )
+    _say_files(json, report, out if add else None)
 
 
 def _after(prepared: Prepared, found: Diagnosis | Addition) -> Comparison:
@@ -421,7 +432,7 @@ def _show_diagnosis(found: Diagnosis, machine: str) -> None:
         for name, p in effect.parameters.items():
             note = "" if p.identified else "   not identified by these data"
             console.print(
-                f"  {name} = {_number(p.value)} {p.unit}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
+                f"  {name} = {_with_unit(p.value, p.unit)}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
             )
         console.print(f"  {effect.why}")
     _show_falls(console, found, machine)
@@ -453,17 +464,21 @@ _LISTED = 3
 
 
 def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> None:
+    units = {s.signal: s.unit for fall in found.falls for s in fall.signals}
+    if not math.isfinite(found.falls[-1].held_out):
+        _show_falls_in_units(console, found, units)
+        return
     table = Table(
         title=f"Error, in multiples of the repeatability between closures (1 = as good as the {machine} repeats)"
     )
-    units = {s.signal: s.unit for fall in found.falls for s in fall.signals}
     signals = list(found.falls[-1].held_out_signals)
     table.add_column("model", no_wrap=True)
     for name in ("training\nclosures", "held-out\nclosures"):
         table.add_column(name, justify="right")
     table.add_column("held-out\nconditions", overflow="fold")
     for signal in signals:
-        table.add_column(f"{signal.replace('_', chr(10), 1)}, {units.get(signal, '')}", justify="right")
+        unit = "" if units[signal] == "1" else f", {units[signal]}"
+        table.add_column(signal.replace("_", "\n", 1) + unit, justify="right")
     for k, fall in enumerate(found.falls):
         if len(fall.by_condition) > _LISTED:
             worst = max(fall.by_condition, key=fall.by_condition.__getitem__)
@@ -484,6 +499,21 @@ def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> 
         console.print("The last columns: error of each signal on held-out conditions.", style="dim")
 
 
+def _show_falls_in_units(console: Console, found: Diagnosis | Addition, units: dict[str, str]) -> None:
+    """The table where nothing was repeated: there is no repeatability to give the errors in."""
+    held, steps = errors_in_units(found.falls)
+    table = Table(title="Error on conditions that were left out of the fit" if held else "Error of the fit")
+    table.add_column("model", no_wrap=True)
+    for signal in steps[-1]:
+        unit = "" if units[signal] == "1" else f", {units[signal]}"
+        table.add_column(signal.replace("_", "\n", 1) + unit, justify="right")
+    for k, (fall, errors) in enumerate(zip(found.falls, steps, strict=True)):
+        table.add_row(
+            ("+ " if k > 1 else "") + fall.added, *(_number(errors.get(s, math.nan), 3) for s in steps[-1])
+        )
+    console.print(table)
+
+
 @interruptible
 def add(
     bags: Bags,
@@ -502,6 +532,7 @@ def add(
     json: Json = False,
 ) -> None:
     """Add effects to the model, fit them, and show the error fall on held-out data."""
+    _check_files(report, out)
     prepared = _prepared(bags, model, objects, signals, rig, scale, jobs, topics)
     _check_effects(prepared, effects or ())
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
@@ -511,26 +542,33 @@ def add(
             executor=executor,
             progress=progress,
         )
-    path = replace(
-        found.model, name=out.stem, provenance={**found.model.provenance, "command": _command()}
-    ).save(out)
-    if report:
-        _write_report(
-            report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
-        )
-    if json:
-        _print_json(found.to_dict() | {"model_file": str(path)})
-        return
+    try:
+        if json:
+            _print_json(found.to_dict() | {"model_file": str(out)})
+        else:
+            _show_addition(found, prepared.rig.machine)
+    finally:
+        replace(
+            found.model, name=out.stem, provenance={**found.model.provenance, "command": _command()}
+        ).save(out)
+        if report:
+            _write_report(
+                report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
+            )
+    _say_files(json, report, out)
+
+
+def _show_addition(found: Addition, machine: str) -> None:
     console = _console()
     for effect in found.effects:
         values = ", ".join(
-            f"{n} = {_number(p.value)} {p.unit} ({_number(p.low, 3)} .. {_number(p.high, 3)})"
+            f"{n} = {_with_unit(p.value, p.unit)} ({_number(p.low, 3)} .. {_number(p.high, 3)})"
             for n, p in effect.parameters.items()
         )
         console.print(f"[bold]{effect.title}[/bold]: {values}")
-    _show_falls(console, found, prepared.rig.machine)
-    console.print(f"Model file: {path}")
-    _say_report(report)
+    _show_falls(console, found, machine)
+    for note in found.notes:
+        console.print(f"note: {note}", style="dim")
 
 
 def hide(
@@ -562,6 +600,7 @@ def hide(
     """Make a measurement set with a hidden effect, to test the lab or to learn what an effect looks like."""
     from .hide import DEFAULT_CONDITIONS, make_set, write_set
 
+    check_writable(truth, "The truth")
     wanted: dict[str, float] = {}
     for text in effects or ():
         name, _, factor = text.partition("=")
@@ -628,6 +667,7 @@ def report(
     json: Json = False,
 ) -> None:
     """Compare, diagnose and add, all on one self-contained HTML page."""
+    _check_files(out)
     prepared = _prepared(bags, model, objects, signals, rig, scale, jobs, topics)
     _check_effects(prepared, effects or ())
     with _Progress(quiet=json) as progress, _executor(jobs, dask, no_cache) as executor:
@@ -639,12 +679,14 @@ def report(
             max_effects=max_effects,
             greedy=greedy,
         )
-    _write_report(out, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found)
-    if json:
-        _print_json({"report": str(out), "verdict": found.verdict})
-        return
-    typer.echo(found.summary)
-    _say_report(out)
+    try:
+        if json:
+            _print_json({"report": str(out), "verdict": found.verdict})
+        else:
+            typer.echo(found.summary)
+    finally:
+        _write_report(out, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found)
+    _say_files(json, out)
 
 
 def _write_report(
@@ -665,6 +707,17 @@ def _write_report(
         write_report(path, **parts, command=_command())
 
 
-def _say_report(path: Path | None) -> None:
-    if path:
-        typer.echo(f"Report: {path.resolve()}")
+def _check_files(report: Path | None, model_file: Path | None = None) -> None:
+    """Refuse files that cannot be written, before the work begins."""
+    if report is not None:
+        check_writable(report, "The report")
+    if model_file is not None:
+        check_model_file(model_file)
+
+
+def _say_files(json: bool, report: Path | None, model_file: Path | None = None) -> None:
+    """Where the files are that were written; with --json the output is the answer alone."""
+    if model_file and not json:
+        typer.echo(f"Model file: {model_file}")
+    if report and not json:
+        typer.echo(f"Report: {report.resolve()}")

@@ -6,7 +6,7 @@ Aligned closures, errors per signal and phase, the thesis' figures, and the resi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from hannes_description.model import Model
 from numpy.typing import NDArray
 
 from .depends import Dependence, residual_dependences
-from .errors import SignalError, overall, signal_errors
+from .errors import SignalError, overall, per_signal, signal_errors
 from .features import Block, Features, data_used
 from .fit import fit
 from .phases import METRICS, PHASES, metrics, phase_of
@@ -101,7 +101,11 @@ class MetricRow:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All of it; `to_dict` is what --json and the report show."""
+    """All of it; `to_dict` is what --json and the report show.
+
+    overall    root mean square of the errors in multiples of the repeatability; NaN where nothing was repeated
+    by_signal  root mean square error of each signal over the conditions, in its unit
+    """
 
     model: Model
     fitted: bool
@@ -113,12 +117,14 @@ class Comparison:
     depends_on: tuple[Dependence, ...]
     data: tuple[Mapping[str, Any], ...]
     notes: tuple[str, ...]
+    by_signal: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         return {
             "model": {"name": self.model.name, "sha256": self.model.sha256},
             "fitted": self.fitted,
             "overall": self.overall,
+            "by_signal": dict(self.by_signal),
             "errors": [e.to_dict() for e in self.errors],
             "cells": [c.to_dict() for c in self.cells],
             "overlays": [o.to_dict() for o in self.overlays],
@@ -148,10 +154,8 @@ def compare(
     contact = _contact(prepared, values)
     labels = [_labels(features, block, contact) for block in features.blocks]
     titles = _titles(features)
-    errors = tuple(
-        replace(e, condition=title)
-        for e, title in zip(signal_errors(features, predicted), titles, strict=True)
-    )
+    of_blocks = signal_errors(features, predicted)
+    errors = tuple(replace(e, condition=title) for e, title in zip(of_blocks, titles, strict=True))
     names = [prepared.rig.phases.get(name, name) for name in PHASES]
     return Comparison(
         model,
@@ -167,6 +171,7 @@ def compare(
         residual_dependences(features, predicted),
         data_used(features),
         (*prepared.notes, *own),
+        per_signal(features, [of_blocks]),
     )
 
 

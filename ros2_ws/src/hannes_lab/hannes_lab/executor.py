@@ -116,18 +116,21 @@ class Executor:
 
 @contextmanager
 def _deaf_workers() -> Iterator[None]:
-    """Processes that start in this block ignore Ctrl-C: they end with this process, and say nothing.
+    """Processes that start in this block ignore Ctrl-C and SIGTERM: they end with this process, and say nothing.
 
-    For those milliseconds this process ignores it too; that it is ignored is what its children inherit.
+    For those milliseconds this process ignores Ctrl-C too, and SIGTERM waits: what is ignored or held back is what its
+    children inherit.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _numbered(number: int, code: str | None, work: Work, shared: Any, key: str, item: tuple[Any, ...]) -> Any:
@@ -157,19 +160,44 @@ def own(rig: Any) -> Any:
     return copy.deepcopy(rig)
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM came: what is being done ends as on Ctrl-C."""
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM raises Terminated in this block, once; a second one is ignored while things end."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        if signal.getsignal(signal.SIGTERM) is end:
+            signal.signal(signal.SIGTERM, before)
+
+
 def interruptible(command: Callable[P, None]) -> Callable[P, None]:
-    """A command that Ctrl-C ends with one line and exit code 130."""
+    """A command that Ctrl-C ends with one line and exit code 130, and SIGTERM with one line and exit code 143."""
 
     @functools.wraps(command)
     def run(*words: P.args, **options: P.kwargs) -> None:
         try:
-            command(*words, **options)
-        except KeyboardInterrupt:
+            with _terminable():
+                command(*words, **options)
+        except KeyboardInterrupt as why:
             kept = not options.get("no_cache")
             rest = (
                 "what was found is kept: the same command goes on from there" if kept else "nothing is kept"
             )
-            print(f"\nhannes: interrupted; {rest}", file=sys.stderr)
-            raise typer.Exit(130) from None
+            what, code = ("terminated", 143) if isinstance(why, Terminated) else ("interrupted", 130)
+            print(f"\nhannes: {what}; {rest}", file=sys.stderr)
+            raise typer.Exit(code) from None
 
     return run

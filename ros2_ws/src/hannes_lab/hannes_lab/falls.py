@@ -24,7 +24,7 @@ from .search import Candidate, Search, key_of
 from .settle import slopes_at
 from .surrogate import exact_rig
 
-NO_REPEATS = "There is one closure of each condition only: nothing could be held out, and the repeatability is a guess."
+NO_REPEATS = "No condition was repeated: there is no repeatability to hold the error against."
 
 
 def error_falls(
@@ -114,13 +114,13 @@ def worth_showing(
 
 
 def fall_sentence(falls: Sequence[Fall]) -> str:
-    """How the error on held-out closures falls, or that it does not; says so where there is one closure only.
+    """How the error on held-out closures falls, or that it does not; in the signals' units where nothing was repeated.
 
     A fit weighs what is known of the model's own error; the error does not.
     """
     before, after = falls[1].held_out, falls[-1].held_out
     if not np.isfinite([before, after]).all():
-        return NO_REPEATS
+        return f"{NO_REPEATS} {_in_units(falls)}".rstrip()
     verb = "falls" if after <= before else "rises"
     said = (
         f"The error on held-out closures {verb} from {before:.2f} (nominal, fitted) to {after:.2f} times the "
@@ -131,3 +131,37 @@ def fall_sentence(falls: Sequence[Fall]) -> str:
     old, new = falls[1].by_condition, falls[-1].by_condition
     each = [f"'{name}' from {old[name]:.2f} to {error:.2f}" for name, error in new.items() if name in old]
     return f"{said} (conditions left out: {', '.join(each)})." if each else f"{said}."
+
+
+def errors_in_units(falls: Sequence[Fall]) -> tuple[bool, list[dict[str, float]]]:
+    """Whether conditions could be left out of the fit, and each step's error by signal, in the signal's unit.
+
+    On conditions that were left out; where there is but one, on those of the fit, root mean square over conditions.
+    """
+    if falls[-1].held_out_signals:
+        return True, [dict(fall.held_out_signals) for fall in falls]
+    out = []
+    for fall in falls:
+        signals = dict.fromkeys(e.signal for e in fall.signals)
+        squares = {s: [e.rmse**2 for e in fall.signals if e.signal == s] for s in signals}
+        out.append({s: float(np.sqrt(np.mean(own))) for s, own in squares.items()})
+    return False, out
+
+
+def _in_units(falls: Sequence[Fall]) -> str:
+    """How the error of each signal changes from the fitted nominal model to the last step."""
+    held, steps = errors_in_units(falls)
+    units = {e.signal: e.unit for e in falls[-1].signals}
+    old, new = steps[1], steps[-1]
+    each = [
+        f"{name} "
+        + (f"{new[name]:.3g}" if len(falls) < 3 else f"from {old[name]:.3g} to {new[name]:.3g}")
+        # a number without a dimension has no unit to name
+        + (f" {units[name]}" if units.get(name, "1") != "1" else "")
+        for name in new
+        if name in old
+    ]
+    where = (
+        "on conditions that were left out of the fit" if held else "of the fit, for nothing could be held out"
+    )
+    return f"Error {where}: {', '.join(each)}." if each else ""

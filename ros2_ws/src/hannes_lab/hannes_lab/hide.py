@@ -201,5 +201,10 @@ def write_set(
             f"No folder '{truth_file.parent}' for the truth: {error.strerror or error}."
         ) from error
     bags = [write_recording(r, folder / str(r.metadata["condition"]), compression="zstd") for r in recordings]
-    truth_file.write_text(yaml.safe_dump(truth.to_dict(), sort_keys=False), encoding="utf-8")
+    try:
+        truth_file.write_text(yaml.safe_dump(truth.to_dict(), sort_keys=False), encoding="utf-8")
+    except OSError as error:
+        raise HannesError(
+            f"The truth cannot be written to '{truth_file}': {error.strerror or error}."
+        ) from error
     return bags

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from .features import stands_for_all
-from .trials import Part, Trial, group_closures, stem_of
+from .trials import OfAll, Part, Trial, group_closures, stem_of
 
 Array = NDArray[np.float64]
 
@@ -87,7 +87,7 @@ def join_trials(trials: Sequence[Trial]) -> list[Trial]:
         if len(names) > 1
     ]
     first, *others = joined
-    told = tuple(note for note in said if note not in first.notes)
+    told = tuple(OfAll(note) for note in said if note not in first.notes)
     return [replace(first, notes=(*first.notes, *told)), *others]
 
 

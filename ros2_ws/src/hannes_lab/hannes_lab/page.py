@@ -193,6 +193,8 @@ class _View:
         self._titles: dict[str, str] = {}
         for name in ("report.css", "page.css"):
             ui.add_head_html(f"<style>{(HERE / 'static' / name).read_text(encoding='utf-8')}</style>")
+        script = (HERE / "static" / "page.js").read_text(encoding="utf-8")
+        ui.add_head_html(f"<script>{script}</script>")
         ui.colors(primary="#1264a8")
         with ui.element("main"):
             ui.html("<h1>Model against measurement</h1>")

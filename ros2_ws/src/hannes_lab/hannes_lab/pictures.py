@@ -145,7 +145,7 @@ class Panel:
 
 def _panels(fall: Part | None, maps: Sequence[Part], ranks: Part | None) -> list[Panel]:
     out = []
-    if fall:
+    if fall and not fall["in_units"]:
         out.append(
             Panel(
                 "Held-out error, × repeatability",
@@ -174,6 +174,8 @@ def _panels(fall: Part | None, maps: Sequence[Part], ranks: Part | None) -> list
     if ranks:
         rows = ranks["first"]
         title = "What each effect alone explains" if ranks["excess"] else "Misfit left, × chance"
+        if ranks["rest"]:
+            title += f" (first {len(rows)} of {len(rows) + len(ranks['rest'])})"
         out.append(
             Panel(
                 title,

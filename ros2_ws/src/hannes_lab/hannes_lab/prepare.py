@@ -27,15 +27,28 @@ from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig, check_parameters
 from .settle import settle
 from .surrogate import rig_for
-from .trials import SIGNALS, Closure, NoClosure, Trial, compared, curves_of, stem_of, trial_of, unique_names
+from .trials import (
+    SIGNALS,
+    Closure,
+    NoClosure,
+    OfAll,
+    Trial,
+    compared,
+    curves_of,
+    stem_of,
+    trial_of,
+    unique_names,
+)
 from .units import in_si
 
 OUTLIER = 6.0
 """A closure whose distance from the median closure exceeds this multiple of the median distance is left out."""
 
-
 DRIFT = 1e-4
 """Chance of a trend below which closures are said to drift."""
+
+FEW = 5
+"""Closures of a condition below which its scatter is no more than guessed, and no test is made (compare.py)."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +138,7 @@ def load_trials(
     if not loaded:
         raise empty[0] if empty else HannesError("No bag was given.")
     first, *others = unique_names(join_repeats(loaded))
-    return [replace(first, notes=(*first.notes, *(f"left out: {why}" for why in left_out))), *others]
+    return [replace(first, notes=(*first.notes, *(OfAll(f"left out: {why}") for why in left_out))), *others]
 
 
 def _with_said(trial: Trial, given: str) -> Trial:
@@ -235,21 +248,35 @@ def prepare(
         if len(where) < len(trials):
             notes.append(f"{signal} is recorded only in {', '.join(where)}")
     notes += drifts(features, rig.machine)
-    few = [c for c in features.conditions if all(b.n < 5 for b in features.blocks if b.condition == c)]
+    most = {c: max(b.n for b in features.blocks if b.condition == c) for c in features.conditions}
+    single = [c for c, n in most.items() if n == 1]
+    if single:
+        notes.append(
+            f"one closure of {', '.join(single)}: how well it repeats is not known, and what the fit takes for scatter "
+            "is a guess from the priors"
+        )
+    few = [c for c, n in most.items() if 1 < n < FEW]
     if few:
         notes.append(
-            f"fewer than five closures of {', '.join(few)}: the repeatability is a guess from the priors"
+            f"fewer than five closures of {', '.join(few)}: what the fit takes for scatter is a guess from the priors "
+            "in part, and no error is called beyond chance"
         )
     return Prepared(rig, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))
 
 
 def notes_of(trials: Sequence[Trial]) -> list[str]:
-    """What is to be said of the recordings; what is said of several of them stands once, with all their names."""
+    """What is to be said of the recordings; what is said of several of them stands once, with all their names.
+
+    What is of no recording alone stands without the name of the one that carries it.
+    """
     of: dict[str, list[str]] = {}
     for trial in trials:
         for note in trial.notes:
             of.setdefault(note, []).append(trial.name)
-    return [f"{', '.join(dict.fromkeys(names))}: {note}" for note, names in of.items()]
+    return [
+        str(note) if isinstance(note, OfAll) else f"{', '.join(dict.fromkeys(names))}: {note}"
+        for note, names in of.items()
+    ]
 
 
 def drifts(features: Features, machine: str = "hand") -> list[str]:

@@ -23,6 +23,7 @@ from markupsafe import Markup
 
 from . import report_text as text
 from .experiments import VISIBLE
+from .report_next import SHOWN, how_sure, next_step, runner_up
 from .report_svg import curve_svg, overlay_svg, tick_text
 
 Part = Mapping[str, Any]
@@ -37,8 +38,17 @@ HOT = 30.0
 DECADES = 8.0
 """Ratio of largest to smallest error from which the error's fall is shown on a logarithmic scale."""
 
+FIGURES = 3
+"""Signals of which the verdict's card shows the error, where it is known in their units only."""
+
 RANKS = 8
 """Rows of the ranking that are open at first."""
+
+NOTES = 5
+"""Notes that are open at first."""
+
+LONG_NOTE, NOTE = 260, 150
+"""Characters from which a note is folded, and of its beginning that stays open."""
 
 PACKAGES = ("hannes_lab", "hannes_sim", "mujoco", "numba", "numpy", "scipy")
 
@@ -119,6 +129,8 @@ def render_report(
         fixed=lambda v, n=2: text.DASH if text.known(v) is None else text.fixed(v, n),
     )
     sources = [part for part in (diagnosis, comparison) if part is not None]
+    verdict, found, ranks = verdict_of(comparison, after, diagnosis), effects(diagnosis), ranking(diagnosis)
+    kind = str(diagnosis.get("verdict", "")) if diagnosis is not None else "comparison"
     context = {
         "title": title,
         "command": command,
@@ -127,22 +139,27 @@ def render_report(
         "before_name": before_name,
         "after_name": after_name,
         "both": after is not None,
-        "verdict": verdict_of(comparison, after, diagnosis),
+        "verdict": verdict,
+        "sure": how_sure(found),
+        "more_effects": max(0, len(found) - SHOWN),
+        "runner_up": runner_up(ranks, diagnosis) if kind in ("effects", "unknown") else None,
+        "next": next_step(kind, diagnosis, command),
         "fall": error_fall(diagnosis),
         "conditions": overlay_groups(comparison, after),
+        "repeated": any(text.known(e.get("repeatability")) is not None for e in _list(comparison, "errors")),
         "maps": failure_maps(comparison, after),
         "dependences": dependences(comparison, after, diagnosis),
-        "effects": effects(diagnosis),
+        "effects": found,
         "tied": tied(diagnosis),
         "experiments": _list(diagnosis, "experiments"),
         "separable": any(
             (text.known(x.get("distance")) or 0.0) >= VISIBLE for x in _list(diagnosis, "experiments")
         ),
-        "ranking": ranking(diagnosis),
+        "ranking": ranks,
         "metrics": metric_groups(comparison, after),
         "nuisances": nuisances(diagnosis),
         "data": _list(sources[0], "data") or _list(sources[-1], "data"),
-        "notes": list(dict.fromkeys(str(n) for part in (*sources, after) for n in _list(part, "notes"))),
+        "notes": notes([*sources, after]),
         "models": _models(comparison, after, diagnosis),
         "json": Markup(embedded_json(data)),
         "scripts": {name: Markup(body) for name, body in scripts.items()},
@@ -151,6 +168,20 @@ def render_report(
         "uplot_licence": _asset("uPlot.LICENSE"),
     }
     return environment.get_template("report.html.j2").render(context)
+
+
+def notes(parts: Sequence[Part | None]) -> dict[str, list[dict[str, str]]]:
+    """Every note once, in the words of the command line: what is open at first, and what is folded.
+
+    Of a long note the beginning is open.
+    """
+    texts = list(dict.fromkeys(str(n) for part in parts for n in _list(part, "notes")))
+    rows = [
+        {"text": note, "short": text.shortened(note, NOTE) if len(note) > LONG_NOTE else ""} for note in texts
+    ]
+    # one that would be folded alone stands with the others
+    shown = len(rows) if len(rows) <= NOTES + 1 else NOTES
+    return {"first": rows[:shown], "rest": rows[shown:]}
 
 
 def embedded_json(data: Any) -> str:
@@ -246,7 +277,20 @@ def lacking(diagnosis: Part | None, titles: Sequence[str]) -> str:
 def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> list[dict[str, str]]:
     out = []
     falls = _list(diagnosis, "falls")
-    if len(falls) > 1:
+    now = after if after is not None else comparison
+    in_units = fall_in_units(falls)
+    if in_units is not None and len(falls) > 1:
+        start, end = in_units["rows"][1 if len(falls) > 2 else 0], in_units["rows"][-1]
+        where = "on conditions that were left out of the fit" if in_units["held"] else "of the fit"
+        for k, (signal, unit) in enumerate(in_units["signals"][:FIGURES]):
+            out.append(
+                {
+                    "value": f"{text.number(end['values'][k])}\u00a0{unit}".strip(),
+                    "was": text.number(start["values"][k]),
+                    "label": f"error of {text.words(signal)} {where}; before: {start['label']}",
+                }
+            )
+    elif len(falls) > 1:
         first = falls[1] if len(falls) > 2 else falls[0]
         out.append(
             {
@@ -255,8 +299,18 @@ def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None
                 "label": f"held-out error, in multiples of the repeatability; before: {first.get('added', '')}",
             }
         )
-    elif comparison is not None:
-        now = after if after is not None else comparison
+    elif now is not None and text.known(now.get("overall")) is None:
+        was = (comparison or {}).get("by_signal") or {} if after is not None else {}
+        for signal, error in list((now.get("by_signal") or {}).items())[:FIGURES]:
+            unit = text.unit(_unit_of(signal, comparison, after))
+            out.append(
+                {
+                    "value": f"{text.number(error)}\u00a0{unit}".strip(),
+                    "was": text.number(was[signal]) if signal in was else "",
+                    "label": f"error of {text.words(signal)}",
+                }
+            )
+    elif comparison is not None and now is not None:
         out.append(
             {
                 "value": text.ratio(now.get("overall")),
@@ -300,11 +354,49 @@ def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None
     return out
 
 
+def fall_in_units(falls: Sequence[Part]) -> dict[str, Any] | None:
+    """The error's fall by signal in its unit, where no repeatability is known; None where one is.
+
+    On conditions that were left out of the fit; where there is but one, on those of the fit.
+    """
+    if not falls or any(text.known(f.get("held_out")) is not None for f in falls):
+        return None
+    units = {str(e.get("signal")): str(e.get("unit", "")) for f in falls for e in f.get("signals", [])}
+    held = bool(falls[-1].get("held_out_signals"))
+    signals = [s for s in units if not held or s in falls[-1]["held_out_signals"]]
+    rows: list[dict[str, Any]] = []
+    for k, fall in enumerate(falls):
+        values = [
+            text.known((fall.get("held_out_signals") or {}).get(s)) if held else _rms_of(fall, s)
+            for s in signals
+        ]
+        added = str(fall.get("added", ""))
+        label = added if k < 2 else f"+ {text.words(added)}"
+        rows.append({"label": label, "kind": "before" if k < 2 else "after", "values": values})
+    if not signals:
+        return None
+    largest = [max((r["values"][k] or 0.0 for r in rows), default=0.0) for k in range(len(signals))]
+    for row in rows:
+        row["widths"] = [
+            round(100.0 * (v or 0.0) / top, 2) if top else 0.0
+            for v, top in zip(row["values"], largest, strict=True)
+        ]
+    return {"held": held, "signals": [(s, text.unit(units[s])) for s in signals], "rows": rows}
+
+
+def _rms_of(fall: Part, signal: str) -> float | None:
+    """Root mean square error of a signal over the conditions of the fit."""
+    errors = [text.known(e.get("rmse")) for e in fall.get("signals", []) if e.get("signal") == signal]
+    known = [e for e in errors if e is not None]
+    return math.sqrt(sum(e**2 for e in known) / len(known)) if known else None
+
+
 def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:
     """Bars of the error, step by step, on one scale: places in percent of the track."""
     falls = _list(diagnosis, "falls")
     if not falls:
         return None
+    in_units = fall_in_units(falls)
     conditions = list(dict.fromkeys(str(c) for f in falls for c in f.get("by_condition", {})))
     values = [
         v
@@ -358,6 +450,7 @@ def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:
         table.append({"condition": c, "signal": s, "unit": u, "steps": steps})
     marks = text.log_ticks(start, stop) if log else text.ticks(start, stop)
     return {
+        "in_units": in_units,
         "rows": rows,
         "log": log,
         "floor": place(1.0),
@@ -385,6 +478,7 @@ def overlay_groups(comparison: Part | None, after: Part | None) -> list[dict[str
                 "unit": str(overlay.get("unit", "")),
                 "before_error": before,
                 "after_error": now,
+                "scaled": any(text.known((e or {}).get("ratio")) is not None for e in (before, now)),
                 "svg": overlay_svg(overlay, _list(after, "overlays")[j] if j is not None else None),
             }
         )
@@ -418,6 +512,7 @@ def failure_maps(comparison: Part | None, after: Part | None) -> list[dict[str, 
                 "fails": sum(bool(c.get("fails")) for c in source),
                 "all": len(source),
                 "judged": any(text.known(c.get("p_value")) is not None for c in source),
+                "scaled": any(text.known(c.get("ratio")) is not None for c in source),
             }
         )
     return out
@@ -611,21 +706,23 @@ def _model_names(comparison: Part | None, after: Part | None, diagnosis: Part | 
 
 
 def _models(comparison: Part | None, after: Part | None, diagnosis: Part | None) -> list[dict[str, str]]:
+    """The models with what was added to each; one row for those that are the same."""
+    added = "".join(f" + {e.get('name', '')}" for e in _list(diagnosis, "effects"))
     rows = [
-        ("before" if after is not None else "compared", comparison),
-        ("after", after),
-        ("diagnosed", diagnosis),
+        ("before" if after is not None else "compared", comparison, ""),
+        ("after", after, added),
+        ("diagnosed", diagnosis, added),
     ]
-    out = [
-        {
-            "role": role,
-            "name": str((part.get("model") or {}).get("name", "")),
-            "sha256": str((part.get("model") or {}).get("sha256", "")),
-        }
-        for role, part in rows
-        if part is not None
-    ]
-    return [m for m in out if m["name"] or m["sha256"]]
+    out: list[dict[str, str]] = []
+    for role, part, more in rows:
+        model = (part or {}).get("model") or {}
+        name, sha256 = str(model.get("name", "")), str(model.get("sha256", ""))
+        same = next((m for m in out if sha256 and m["sha256"] == sha256), None)
+        if same is not None:
+            same["role"] += f", {role}"
+        elif name or sha256:
+            out.append({"role": role, "name": name + more, "sha256": sha256})
+    return out
 
 
 def _unit_of(signal: str, *parts: Part | None) -> str:

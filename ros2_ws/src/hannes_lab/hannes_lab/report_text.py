@@ -97,9 +97,13 @@ def plus_minus(value: Any, sd: Any, digits: int = 3) -> str:
 
 
 def unit(text: Any) -> str:
-    """N.m/rad3 -> N·m/rad³."""
-    return re.sub(
-        r"(?<=[A-Za-z])(-?\d+)", lambda m: m.group(1).translate(_SUPERSCRIPT), str(text).replace(".", "·")
+    """N.m/rad3 -> N·m/rad³; nothing for a number without a dimension."""
+    return (
+        ""
+        if str(text) == "1"
+        else re.sub(
+            r"(?<=[A-Za-z])(-?\d+)", lambda m: m.group(1).translate(_SUPERSCRIPT), str(text).replace(".", "·")
+        )
     )
 
 
@@ -130,6 +134,11 @@ def interval(value: Any, low: Any, high: Any, unit_text: Any) -> dict[str, str]:
 def words(name: Any) -> str:
     """A field's name as words: motor_current -> motor current."""
     return str(name).replace("_", " ")
+
+
+def shortened(sentence: str, most: int) -> str:
+    """The beginning of a sentence, whole words of at most so many characters, with dots where it goes on."""
+    return sentence if len(sentence) <= most else f"{sentence[:most].rsplit(None, 1)[0].rstrip(',;:')} …"
 
 
 def listed(texts: Sequence[str], last: str = "and") -> str:

@@ -99,6 +99,10 @@ class Part:
     begin: float
 
 
+class OfAll(str):
+    """A note on the recordings as a set, which the first of them carries: it is said without a recording's name."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """One recording, ready to be replayed; or a few that repeat one condition, one after the other.

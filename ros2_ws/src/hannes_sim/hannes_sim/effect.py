@@ -10,6 +10,7 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cache, lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -211,8 +212,10 @@ def load_effect(name_or_source: str) -> EffectType:
     if ":" not in name_or_source:
         found = catalogue()
         if name_or_source not in found:
+            near = get_close_matches(name_or_source, found, 1)
+            meant = f"did you mean {near[0]}? The" if near else "the"
             raise HannesError(
-                f"Unknown effect '{name_or_source}'; the catalogue has {', '.join(sorted(found))}; "
+                f"Unknown effect '{name_or_source}'; {meant} catalogue has {', '.join(sorted(found))}; "
                 "an own effect is given as path.py:Class."
             )
         return found[name_or_source]
@@ -220,7 +223,7 @@ def load_effect(name_or_source: str) -> EffectType:
     effect = load_class(file, class_name, "effect")
     if not (inspect.isclass(effect) and issubclass(effect, Effect)):
         raise HannesError(f"'{class_name}' in '{file}' is not a subclass of hannes_sim.effect.Effect.")
-    return check_effect(effect, file)
+    return check_effect(effect, f"{file}, class {class_name}")
 
 
 def reason(error: Exception) -> str:
@@ -262,7 +265,10 @@ def load_class(file: str, class_name: str, what: str) -> Any:
             spec.loader.exec_module(module)
         except Exception as error:  # whatever a user's file raises is reported as one clear error
             del sys.modules[module_name]
-            raise HannesError(f"'{file}' cannot be imported: {reason(error)}.") from error
+            own = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
+            inside = f", in {own[-1].name}" if own and own[-1].name != "<module>" else ""
+            where = f" (line {own[-1].lineno}{inside})" if own else ""
+            raise HannesError(f"'{file}' cannot be imported: {reason(error)}{where}.") from error
     if not hasattr(module, class_name):
         names = ", ".join(
             c.__name__ for _, c in inspect.getmembers(module, inspect.isclass) if c.__module__ == module_name

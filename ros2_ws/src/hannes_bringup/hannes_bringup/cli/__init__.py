@@ -2,7 +2,8 @@
 
 Each subcommand is one line of COMMANDS: its name, the function or typer.Typer that carries it out (imported only when
 it is called, so that `hannes --help` is quick), and one sentence for the list. Exit codes: 0 done, 1 a node or a check
-failed, 2 wrong use or bad input (one line on stderr), 130 interrupted.
+failed or the output could not be written, 2 wrong use or bad input (one line on stderr), 130 interrupted, 141 the
+reader of the output has gone, 143 terminated.
 """
 
 from __future__ import annotations
@@ -124,6 +125,7 @@ def load(command: Command) -> Any:
 
 def main() -> int:
     """Entry point of `hannes`."""
+    code: int | str | None = 0
     try:
         build_app()()
     except HannesError as error:
@@ -131,8 +133,46 @@ def main() -> int:
         return 2
     except KeyboardInterrupt:
         return 130
+    except SystemExit as end:
+        # typer and rich say this where a pipe broke; whether one did stands in the context
+        if isinstance(end.__context__, BrokenPipeError):
+            return _nobody_reads()
+        code = end.code
     except BrokenPipeError:
-        # the reader of a pipe has gone (`hannes nodes | head`); say nothing when Python flushes at exit
-        sys.stdout = None
-        return 1
-    return 0
+        return _nobody_reads()
+    except OSError:
+        reason = _failing_output("\n")  # what could not be written before is in no buffer any more
+        if not reason:
+            raise
+        return _output_failed(reason)
+    reason = _failing_output()
+    if reason:
+        return _output_failed(reason)
+    if code is None or isinstance(code, int):
+        return code or 0
+    raise SystemExit(code)
+
+
+def _nobody_reads() -> int:
+    """The exit code where the reader of a pipe has gone (`hannes nodes | head`), as the shell gives it for SIGPIPE."""
+    sys.stdout = None  # or Python complains when it flushes at exit
+    return 141
+
+
+def _failing_output(text: str = "") -> str:
+    """Why the standard output takes what is in its buffer and this text not; empty if it does."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.write(text)
+            sys.stdout.flush()
+    except BrokenPipeError:
+        return "its reader has gone"
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+def _output_failed(reason: str) -> int:
+    sys.stdout = None
+    print(f"hannes: the output cannot be written: {reason}.", file=sys.stderr)
+    return 1

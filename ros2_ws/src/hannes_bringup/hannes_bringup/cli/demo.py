@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -81,8 +82,6 @@ def _fresh(out: Path) -> None:
 
 def _run_graph(grasp: str, out: Path, emg: str, seconds: float, say: Callable[[str], None]) -> Recording:
     """One closure through the node graph, each node a process; gives back what the bag holds."""
-    from hannes_bags.reading import read_bag
-
     bag, log = out / f"graph_{grasp}", out / f"graph_{grasp}.log"
     say(f"node graph in lock-step, object: {grasp} ({seconds:g} s simulated, plant: MuJoCo)")
     command = [
@@ -124,7 +123,7 @@ def _run_graph(grasp: str, out: Path, emg: str, seconds: float, say: Callable[[s
             f"The node graph ended with code {done.returncode}; see {log}. Last line: "
             f"{last[-1] if last else '(none)'}"
         )
-    recording = read_bag(bag)
+    recording = _read(bag, say)
     recording.require(["motor_current", "encoder_position", "reference_position", "stiffness_label"])
     current = recording["motor_current"].values
     labels = Counter(str(label) for label in recording["stiffness_label"].values)
@@ -134,6 +133,18 @@ def _run_graph(grasp: str, out: Path, emg: str, seconds: float, say: Callable[[s
         f"{current.max():.2f} A, grip force {force:.1f} N; classifier: "
         + ", ".join(f"{label} {100 * n / labels.total():.0f} %" for label, n in labels.most_common())
     )
+    return recording
+
+
+def _read(bag: Path, say: Callable[[str], None]) -> Recording:
+    """The bag; what was noticed in it is said in plain lines, not as Python's warnings."""
+    from hannes_bags.reading import RecordingWarning, read_bag
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RecordingWarning)
+        recording = read_bag(bag)
+    for sentence in recording.warnings:
+        say(f"  {sentence}")
     return recording
 
 

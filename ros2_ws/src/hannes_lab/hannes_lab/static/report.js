@@ -268,6 +268,25 @@
     });
   });
 
+  /* In a frame whose page answers, that page makes the frame as tall as this and scrolls: one scroll bar is enough. */
+  var around = window.parent;
+  function tell(what) { around.postMessage({ hannesReport: what }, "*"); }
+  if (around !== window) {
+    var grown = function () { tell({ height: root.offsetHeight }); };
+    new ResizeObserver(grown).observe(root);
+    grown(); /* a frame below the window's edge is not drawn, and not observed */
+    window.addEventListener("message", function (event) {
+      if (event.source === around && event.data && event.data.hannesPage) root.classList.add("framed");
+    });
+    document.addEventListener("click", function (event) {
+      var link = event.target.closest('a[href^="#"]');
+      var goal = link && document.getElementById(link.getAttribute("href").slice(1));
+      if (!goal || !root.classList.contains("framed")) return;
+      event.preventDefault();
+      tell({ top: goal.getBoundingClientRect().top });
+    });
+  }
+
   var closed = [];
   window.addEventListener("beforeprint", function () {
     closed = Array.prototype.filter.call(document.querySelectorAll("main details"), function (d) { return !d.open; });
