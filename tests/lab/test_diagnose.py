@@ -376,12 +376,12 @@ def test_triples_are_not_tried_where_the_pairs_lead_nowhere(tmp_path: Path) -> N
 def test_a_parameter_at_the_end_of_its_range_is_pointed_out(tmp_path: Path) -> None:
     file, narrow = tmp_path / "latch.py", tmp_path / "narrow.py"
     file.write_text(OUTSIDE)
-    narrow.write_text(OUTSIDE.replace('"N.m", 0.0, 1.0, 0.05', '"N.m", 0.0, 0.02, 0.01'))
+    narrow.write_text(OUTSIDE.replace('"N.m", 0.0, 1.0, 0.05', '"N.m", 0.0, 0.025, 0.01'))
     prepared, _ = data([f"{file}:Flap"], seed=105, conditions=QUICK[1:])
     found = diagnose(prepared, effect_sources([f"{narrow}:Flap"], only=[]), max_effects=1)
-    assert found.effects[0].parameters["torque"].value == pytest.approx(0.02, rel=1e-3)
+    assert found.effects[0].parameters["torque"].value == pytest.approx(0.025, rel=1e-3)
     assert not found.effects[0].parameters["torque"].identified
-    assert any("latch.torque lies at the end of its range (0 to 0.02 N.m)" in note for note in found.notes)
+    assert any("latch.torque lies at the end of its range (0 to 0.025 N.m)" in note for note in found.notes)
 
 
 @pytest.mark.slow
