@@ -79,10 +79,8 @@ class Emps(PlantRig):
 
     @staticmethod
     def _read(path: Path) -> Trial:
-        if path.is_dir():
-            raise HannesError(f"'{path}' is a folder: give the path of DATA_EMPS.mat in it.")
         if not path.is_file():
-            raise HannesError(f"No file '{path}': give the path of DATA_EMPS.mat.")
+            raise HannesError(f"{'A folder:' if path.is_dir() else 'No file'} '{path}'; give DATA_EMPS.mat.")
         try:
             data = loadmat(path)
             t, reference, position, voltage, gtau = (np.asarray(data[n], float).ravel() for n in FIELDS)
