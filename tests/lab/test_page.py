@@ -273,7 +273,6 @@ def test_cancelled_and_gone_on_a_diagnosis_is_that_of_the_command(
     code, out, _ = hannes(*words[1:], "--json", "--jobs", "1", capsys=capsys, monkeypatch=monkeypatch)
     mine, its = json.loads(files["answer.json"].read_text()), json.loads(out)
     assert code == 0 and its.pop("model_file") == "my_hand.yaml"
-    assert mine.pop("simulations") > its.pop("simulations"), "the command took it from the store"
     assert mine == its
     assert Model.load("my_hand.yaml").sha256 == Model.load(files["my_hand.yaml"]).sha256
 
