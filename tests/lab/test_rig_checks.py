@@ -354,7 +354,7 @@ def test_what_is_said_to_another_machine_is_not_said_of_a_hand(lab: Lab) -> None
     assert code == 0 and "record another speed, and another load" in out and "forward" in out
     assert not re.search(r"\b(hand|grasp|void|opening)\b", out)
     single = "replace(t, closures=t.closures[:1])"
-    assert "not known in repeatabilities" in lab(single)[1]
+    assert "how well it repeats is not known" in lab(single)[1]
     alone = "replace(t, signals={'encoder_position': t.signals['encoder_position']})"
     assert "no drive force is recorded" in lab(alone)[1]
 

@@ -136,8 +136,8 @@ def test_it_works_through_and_says_so(
         (
             without("reference_position"),
             "has no reference_position: it is needed, for the model replays it. If it was recorded under another "
-            "topic, name that with --topic SIGNAL=TOPIC (topics={signal: topic} in Python); the bag has no other "
-            "topic.",
+            "topic, name that with --topic SIGNAL=TOPIC (topics={signal: topic} in Python); the bag has no topics but "
+            "those that were read: /hannes/motor/state as encoder_position, ",
         ),
         (scaled(encoder_position=3.8), "at another shaft"),
         (scaled(encoder_position=19.0), "at another shaft"),

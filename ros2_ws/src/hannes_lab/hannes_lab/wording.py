@@ -12,7 +12,7 @@ from .choose import Choice, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
-from .falls import NO_REPEATS, fall_sentence
+from .falls import fall_sentence
 from .fit import Fit, fit
 from .problem import Problem, nuisance_coordinate
 from .rig import Nuisance
@@ -70,7 +70,7 @@ def summary(
         held = (
             f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability."
             if np.isfinite(falls[-1].held_out)
-            else NO_REPEATS
+            else fall
         )
         nearest = "" if choice.idle else nearest_sentence(choice)
         return f"Nothing is missing: with its own parameters fitted, {explained}{other}. {held}{far and far + nearest}"
