@@ -1,6 +1,7 @@
 """A fit in closed loop: derivatives are taken seldom, and it ends where one that takes them always would."""
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from hannes_description.model import Model
 from hannes_lab.fit import Derivatives, Fit, finite_differences, fit, over_its_spread, prior_weights
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
-from hannes_lab.problem import Coordinate, nuisance_coordinate
+from hannes_lab.problem import Coordinate, Problem, nuisance_coordinate
 from hannes_lab.trials import make_trial
 from scipy.optimize import least_squares
 
@@ -68,11 +69,16 @@ A, B = (Coordinate(name, 0.0, 1.0, False, -10.0, 10.0, True, 1e-4) for name in "
 BEGIN = np.array([1.0, 1.0])
 
 
+def as_problem(curved: Curved) -> Problem:
+    """It has all of a problem that derivatives need."""
+    return cast(Problem, curved)
+
+
 def derivatives(problem: Curved, known: dict[str, np.ndarray], most: int = 10) -> Derivatives:
     def cost(r: np.ndarray, z: np.ndarray) -> float:
         return float(r @ r)
 
-    found = Derivatives(problem, Model.load(), (A, B), known, {}, cost, most)  # type: ignore[arg-type]
+    found = Derivatives(as_problem(problem), Model.load(), (A, B), known, {}, cost, most)
     found.at(BEGIN, problem.at(BEGIN))
     return found
 
@@ -132,17 +138,12 @@ def test_a_derivative_at_the_edge_of_what_can_be_simulated_is_taken_to_the_other
     for edge, lowest in ((1.0, -np.inf), (1.0 + 5e-5, 1.0 - 5e-5)):
         problem = Cliff(edge, lowest)
         found = finite_differences(
-            problem,  # type: ignore[arg-type]
-            Model.load(),
-            (A, B),
-            BEGIN,
-            problem.at(BEGIN),
-            (0, 1),
+            as_problem(problem), Model.load(), (A, B), BEGIN, problem.at(BEGIN), (0, 1)
         )
         np.testing.assert_allclose(found, [[320.0, 20.0], [50.0, 420.0]], rtol=1e-3)
         assert problem.failures > 0
     alone = Cliff(1.0, 1.0)
-    found = finite_differences(alone, Model.load(), (A, B), BEGIN, alone.at(BEGIN), (0, 1))  # type: ignore[arg-type]
+    found = finite_differences(as_problem(alone), Model.load(), (A, B), BEGIN, alone.at(BEGIN), (0, 1))
     np.testing.assert_array_equal(found[:, 0], 0.0)
     assert found[1, 1] == pytest.approx(420.0, rel=1e-3)
 
@@ -150,7 +151,7 @@ def test_a_derivative_at_the_edge_of_what_can_be_simulated_is_taken_to_the_other
 def test_an_interval_at_the_edge_is_taken_from_the_side_that_can_be_simulated() -> None:
     problem = Cliff(1.0)
     fit_ = Fit(Model.load(), (A, B), BEGIN, 0.0, problem.at(BEGIN), np.array([[320.0, 20.0], [50.0, 420.0]]))
-    wider = over_its_spread(problem, fit_)  # type: ignore[arg-type]
+    wider = over_its_spread(as_problem(problem), fit_)
     assert problem.failures > 0
     np.testing.assert_allclose(wider.jacobian, fit_.jacobian, rtol=0.01)
 

@@ -477,8 +477,7 @@ def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> 
         table.add_column(name, justify="right")
     table.add_column("held-out\nconditions", overflow="fold")
     for signal in signals:
-        unit = "" if units[signal] == "1" else f", {units[signal]}"
-        table.add_column(signal.replace("_", "\n", 1) + unit, justify="right")
+        table.add_column(_heading(signal, units[signal]), justify="right")
     for k, fall in enumerate(found.falls):
         if len(fall.by_condition) > _LISTED:
             worst = max(fall.by_condition, key=fall.by_condition.__getitem__)
@@ -499,14 +498,18 @@ def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> 
         console.print("The last columns: error of each signal on held-out conditions.", style="dim")
 
 
+def _heading(signal: str, unit: str) -> str:
+    """A signal as the heading of a column, with its unit."""
+    return signal.replace("_", "\n", 1) + ("" if unit == "1" else f", {unit}")
+
+
 def _show_falls_in_units(console: Console, found: Diagnosis | Addition, units: dict[str, str]) -> None:
     """The table where nothing was repeated: there is no repeatability to give the errors in."""
-    held, steps = errors_in_units(found.falls)
+    held, steps = errors_in_units([fall.to_dict() for fall in found.falls])
     table = Table(title="Error on conditions that were left out of the fit" if held else "Error of the fit")
     table.add_column("model", no_wrap=True)
     for signal in steps[-1]:
-        unit = "" if units[signal] == "1" else f", {units[signal]}"
-        table.add_column(signal.replace("_", "\n", 1) + unit, justify="right")
+        table.add_column(_heading(signal, units[signal]), justify="right")
     for k, (fall, errors) in enumerate(zip(found.falls, steps, strict=True)):
         table.add_row(
             ("+ " if k > 1 else "") + fall.added, *(_number(errors.get(s, math.nan), 3) for s in steps[-1])

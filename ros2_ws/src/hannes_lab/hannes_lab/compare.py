@@ -18,7 +18,7 @@ from .errors import SignalError, overall, per_signal, signal_errors
 from .features import Block, Features, data_used
 from .fit import fit
 from .phases import METRICS, PHASES, metrics, phase_of
-from .prepare import Prepared
+from .prepare import FEW, Prepared
 from .problem import nuisance_coordinate
 from .wording import clock_note
 
@@ -249,9 +249,9 @@ def _cells(
             rmse = float(np.sqrt(((block.measured - model)[:, own] ** 2).mean()))
             seen = float((residual[own] ** 2).mean())
             p = float("nan")
-            if n >= 5 and floor > 0.0 and seen <= floor**2:
+            if n >= FEW and floor > 0.0 and seen <= floor**2:
                 p = 1.0  # the same closures again and again, and the model as near as can be told
-            elif n >= 5:
+            elif n >= FEW:
                 # Means of randomly signed deviations: what the mean residual would be by scatter alone.
                 draws = rng.choice([-1.0, 1.0], size=(DRAWS, n)) @ e[:, own] / n * np.sqrt(n / (n - 1.0))
                 p = float((1 + ((draws**2).mean(axis=1) >= seen).sum()) / (1 + DRAWS))

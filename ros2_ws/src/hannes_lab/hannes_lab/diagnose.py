@@ -121,11 +121,11 @@ def diagnose(
     while greedy and len(best.names) > 1 and (why := _idle_at_the_end(search, best, limits, falls)):
         left_out.append(f"{best.names[-1]} joined too, but {why}: it is left out")
         falls = falls[:-1]
-        best = search.with_spread(search.known(best.names[:-1]))
+        best = search.with_spread(search.fit_of(best.names[:-1]))
         tied = (best.names,) if tied else ()
     effects = found_effects(search, best, limits, falls)
     experiments = (
-        separating_experiments(prepared, search, [search.known(n) for n in tied]) if len(tied) > 1 else ()
+        separating_experiments(prepared, search, [search.fit_of(n) for n in tied]) if len(tied) > 1 else ()
     )
     return Diagnosis(
         verdict=verdict,
@@ -271,7 +271,7 @@ def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple
         keep -= 1
     if keep == len(choice.best.names) or not (rig.foreign or choice.search.problem.discrepancy):
         return choice, falls
-    part = choice.search.known([fall.added for fall in falls[2 : keep + 2]])
+    part = choice.search.fit_of([fall.added for fall in falls[2 : keep + 2]])
     if not is_adequate(choice.search, part, choice.limits):
         return choice, falls
     if leads_back(part, choice.best):

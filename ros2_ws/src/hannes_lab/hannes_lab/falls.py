@@ -59,7 +59,7 @@ def error_falls(
     left = list(best.names)
     while left:
         options = [
-            search.found.get(key_of((*chain, name))) or search.add(search.known(chain), name)
+            search.found.get(key_of((*chain, name))) or search.add(search.fit_of(chain), name)
             for name in (left[:1] if in_order else left)
         ]
         pick = min(range(len(options)), key=lambda k: options[k].penalised)
@@ -110,7 +110,7 @@ def worth_showing(
     names = tuple(fall.added for fall in falls[2 : keep + 1])
     if len(names) == len(best.names):
         return best, falls
-    return search.known(names), falls[: keep + 1]
+    return search.fit_of(names), falls[: keep + 1]
 
 
 def fall_sentence(falls: Sequence[Fall]) -> str:
@@ -133,24 +133,27 @@ def fall_sentence(falls: Sequence[Fall]) -> str:
     return f"{said} (conditions left out: {', '.join(each)})." if each else f"{said}."
 
 
-def errors_in_units(falls: Sequence[Fall]) -> tuple[bool, list[dict[str, float]]]:
+def errors_in_units(falls: Sequence[Mapping[str, Any]]) -> tuple[bool, list[dict[str, float]]]:
     """Whether conditions could be left out of the fit, and each step's error by signal, in the signal's unit.
 
     On conditions that were left out; where there is but one, on those of the fit, root mean square over conditions.
+    falls   as Fall.to_dict gives them
     """
-    if falls[-1].held_out_signals:
-        return True, [dict(fall.held_out_signals) for fall in falls]
+    if falls[-1].get("held_out_signals"):
+        return True, [dict(fall.get("held_out_signals") or {}) for fall in falls]
     out = []
     for fall in falls:
-        signals = dict.fromkeys(e.signal for e in fall.signals)
-        squares = {s: [e.rmse**2 for e in fall.signals if e.signal == s] for s in signals}
+        squares: dict[str, list[float]] = {}
+        for e in fall.get("signals", ()):
+            if e.get("rmse") is not None:
+                squares.setdefault(str(e.get("signal")), []).append(e["rmse"] ** 2)
         out.append({s: float(np.sqrt(np.mean(own))) for s, own in squares.items()})
     return False, out
 
 
 def _in_units(falls: Sequence[Fall]) -> str:
     """How the error of each signal changes from the fitted nominal model to the last step."""
-    held, steps = errors_in_units(falls)
+    held, steps = errors_in_units([fall.to_dict() for fall in falls])
     units = {e.signal: e.unit for e in falls[-1].signals}
     old, new = steps[1], steps[-1]
     each = [

@@ -77,15 +77,13 @@ def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
     out = []
     for k, trial in enumerate(trials):
         given = trial.options.get("object")
-        free = "object" not in trial.options or (isinstance(given, str) and given != "none")
-        denied = given == "none" and "sensors" not in trial.options
-        if not (free or denied) or ("object" in trial.options and "sensors" in trial.options):
+        if "object" in trial.options and (not isinstance(given, str) or "sensors" in trial.options):
             out.append(trial)
             continue
         seen = _felt(trial, model) or _seen(
             curves[k], [c for j, c in enumerate(curves) if j != k], _nominal(model)
         )
-        if denied:
+        if given == "none":
             if seen is not None:
                 note = (
                     "nothing was grasped, as was said, though the closures look as if something was, from "

@@ -214,10 +214,6 @@ class Problem:
 
     def __post_init__(self) -> None:
         self._measured = self.features.measured
-        rows = np.sort(np.concatenate([rows for rows, _ in self.whitener]))
-        assert np.array_equal(rows, np.arange(self.features.size)), (
-            "the whitener must cover each feature once"
-        )
 
     @property
     def simulations(self) -> int:
@@ -358,6 +354,8 @@ def build_problem(
                 covariance = covariance + own_error
                 discrepancy.append((part.rows, _factor(own_error)))
             whitener.append((part.rows, _factor(covariance)))
+    covered = np.sort(np.concatenate([rows for rows, _ in whitener]))
+    assert np.array_equal(covered, np.arange(features.size)), "the whitener must cover each feature once"
     return Problem(rig, features, tuple(whitener), tuple(deviations), counts or Counts(), tuple(discrepancy))
 
 

@@ -23,6 +23,7 @@ from markupsafe import Markup
 
 from . import report_text as text
 from .experiments import VISIBLE
+from .falls import errors_in_units
 from .report_next import SHOWN, how_sure, next_step, runner_up
 from .report_svg import curve_svg, overlay_svg, tick_text
 
@@ -362,14 +363,11 @@ def fall_in_units(falls: Sequence[Part]) -> dict[str, Any] | None:
     if not falls or any(text.known(f.get("held_out")) is not None for f in falls):
         return None
     units = {str(e.get("signal")): str(e.get("unit", "")) for f in falls for e in f.get("signals", [])}
-    held = bool(falls[-1].get("held_out_signals"))
-    signals = [s for s in units if not held or s in falls[-1]["held_out_signals"]]
+    held, steps = errors_in_units(falls)
+    signals = [s for s in units if not held or s in steps[-1]]
     rows: list[dict[str, Any]] = []
-    for k, fall in enumerate(falls):
-        values = [
-            text.known((fall.get("held_out_signals") or {}).get(s)) if held else _rms_of(fall, s)
-            for s in signals
-        ]
+    for k, (fall, errors) in enumerate(zip(falls, steps, strict=True)):
+        values = [text.known(errors.get(s)) for s in signals]
         added = str(fall.get("added", ""))
         label = added if k < 2 else f"+ {text.words(added)}"
         rows.append({"label": label, "kind": "before" if k < 2 else "after", "values": values})
@@ -382,13 +380,6 @@ def fall_in_units(falls: Sequence[Part]) -> dict[str, Any] | None:
             for v, top in zip(row["values"], largest, strict=True)
         ]
     return {"held": held, "signals": [(s, text.unit(units[s])) for s in signals], "rows": rows}
-
-
-def _rms_of(fall: Part, signal: str) -> float | None:
-    """Root mean square error of a signal over the conditions of the fit."""
-    errors = [text.known(e.get("rmse")) for e in fall.get("signals", []) if e.get("signal") == signal]
-    known = [e for e in errors if e is not None]
-    return math.sqrt(sum(e**2 for e in known) / len(known)) if known else None
 
 
 def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:

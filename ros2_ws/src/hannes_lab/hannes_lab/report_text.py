@@ -98,12 +98,10 @@ def plus_minus(value: Any, sd: Any, digits: int = 3) -> str:
 
 def unit(text: Any) -> str:
     """N.m/rad3 -> N·m/rad³; nothing for a number without a dimension."""
-    return (
-        ""
-        if str(text) == "1"
-        else re.sub(
-            r"(?<=[A-Za-z])(-?\d+)", lambda m: m.group(1).translate(_SUPERSCRIPT), str(text).replace(".", "·")
-        )
+    if str(text) == "1":
+        return ""
+    return re.sub(
+        r"(?<=[A-Za-z])(-?\d+)", lambda m: m.group(1).translate(_SUPERSCRIPT), str(text).replace(".", "·")
     )
 
 

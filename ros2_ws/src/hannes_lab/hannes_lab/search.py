@@ -484,7 +484,7 @@ class Search:
         z, jacobian = larger.z[index], larger.jacobian[:, index]
         return replace(larger, model=model, coordinates=coordinates, z=z, jacobian=jacobian)
 
-    def known(self, names: Sequence[str]) -> Candidate:
+    def fit_of(self, names: Sequence[str]) -> Candidate:
         """The fit of a set that was found; the model as it is is fitted if it was not yet."""
         return self.found[key_of(names)] if names else self.null()
 
