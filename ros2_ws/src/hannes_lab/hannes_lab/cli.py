@@ -414,14 +414,17 @@ def diagnose(
             named = replace(found.model, name=out.stem)
             with_provenance(named, prepared, found.falls, _command()).save(out)
         if report:
-            _write_report(
-                report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
-            )
+            _report_of(report, prepared, found)
     _say_files(json, report, out if add else None)
 
 
 def _after(prepared: Prepared, found: Diagnosis | Addition) -> Comparison:
     return compare_model(replace(prepared, model=found.model), values=found.values)
+
+
+def _report_of(path: Path, prepared: Prepared, found: Diagnosis | Addition) -> None:
+    """The report of a model before and after what was found."""
+    _write_report(path, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found)
 
 
 def _show_diagnosis(found: Diagnosis, machine: str) -> None:
@@ -555,9 +558,7 @@ def add(
             found.model, name=out.stem, provenance={**found.model.provenance, "command": _command()}
         ).save(out)
         if report:
-            _write_report(
-                report, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found
-            )
+            _report_of(report, prepared, found)
     _say_files(json, report, out)
 
 
@@ -688,7 +689,7 @@ def report(
         else:
             typer.echo(found.summary)
     finally:
-        _write_report(out, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found)
+        _report_of(out, prepared, found)
     _say_files(json, out)
 
 
