@@ -7,7 +7,8 @@ that an interrupted run goes on where it stopped.  `--tuning` takes other seeds 
 `--full-hand` takes closures of the full hand in MuJoCo instead, without what describes them: a third simulator to the
 reduced plant, on which no threshold was set.  `--lugre` takes the hand of `bench/lugre_hand.py`, with another friction,
 other gains and another move: first the sets of which the failures were looked into, then others.  `--wound` takes both
-hands with the wire wound up at encoder zero, so that they rest off their open stop.
+hands with the wire wound up at encoder zero, so that they rest off their open stop.  `--voltage` takes recordings that
+have the motor's voltage too.
 """
 
 from __future__ import annotations
@@ -59,6 +60,9 @@ LOGS = {
 }
 """Rate (Hz), averaging window (s) and rectifier of the current, and rate of the reference's log (Hz)."""
 
+AND_VOLTAGE = ", voltage"
+"""Ends the name of a log that has the motor's voltage too, as it was commanded last."""
+
 STORE = get_typestore(Stores.ROS2_JAZZY)
 FLOAT, JOINTS = STORE.types["std_msgs/msg/Float64"], STORE.types["sensor_msgs/msg/JointState"]
 HEADER, TIME = STORE.types["std_msgs/msg/Header"], STORE.types["builtin_interfaces/msg/Time"]
@@ -91,7 +95,9 @@ HIDDEN: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...]], ...] =
 )
 """What is hidden, as the catalogue calls it if it does, the log, and values of Hand (`viscous`, `rotor` as factors)."""
 
-OUTSIDE = ("a worn spot", "quadratic drag", "hysteresis", "a shaking mount")
+OUTSIDE = (
+    "a worn spot", "quadratic drag", "hysteresis", "a shaking mount", "a torque constant that falls",
+)  # fmt: skip
 RELATIVE = ("viscous", "rotor")
 
 CLEAN: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = (
@@ -176,6 +182,19 @@ WOUND: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...], bool], .
 whether the hand is that of bristles."""
 
 
+VOLTAGE: tuple[tuple[tuple[str, ...], str, tuple[tuple[str, float], ...], str], ...] = (
+    ((), "100 Hz", (), "rigid"),
+    ((), "50 Hz", (("friction", 0.022), ("wire", 1.2)), "soft"),
+    ((), "30 Hz rectified", (("kp", 0.5), ("current_kp", 0.09), ("current_ki", 900.0)), "rigid"),
+    (("brush_drop",), "100 Hz", (("brush", 0.25),), "rigid"),
+    (("supply_sag",), "50 Hz", (("source", 0.6),), "rigid"),
+    (("stribeck_friction",), "100 Hz", (("stiction", 0.03), ("stiction_speed", 0.7)), "rigid"),
+    (("glove_stiffness", "brush_drop"), "100 Hz", (("glove", 4e-5), ("brush", 0.3)), "rigid"),
+    (("a torque constant that falls",), "50 Hz", (("saturation", 0.05),), "rigid"),
+)
+"""Recordings with the motor's voltage: what is hidden, the log, values of Hand, and what is grasped."""
+
+
 @dataclass(frozen=True)
 class Case:
     """One set of recordings: slow and fast closures on nothing, slow ones on an object."""
@@ -215,6 +234,14 @@ def wound_cases() -> list[Case]:
     return [
         Case(hidden, log, values, 650 + k, lugre=lugre)
         for k, (hidden, log, values, lugre) in enumerate(WOUND)
+    ]
+
+
+def voltage_cases() -> list[Case]:
+    """The sets with the motor's voltage."""
+    return [
+        Case(hidden, log + AND_VOLTAGE, values, 750 + k, grasp)
+        for k, (hidden, log, values, grasp) in enumerate(VOLTAGE)
     ]
 
 
@@ -269,6 +296,13 @@ def record(case: Case, folder: Path) -> None:
         _write(folder / name, commanded, signals, simulator.TICK, case.log, rng)
 
 
+def _averaged(values: np.ndarray, width: int) -> np.ndarray:
+    """Mean (n,) over the last `width` values; before the first they were zero."""
+    total = np.concatenate([np.zeros(width), np.cumsum(values)])
+    mean: np.ndarray = (total[width:] - total[:-width]) / width
+    return mean
+
+
 def _write(
     folder: Path,
     reference: np.ndarray,
@@ -277,11 +311,9 @@ def _write(
     log: str,
     rng: np.random.Generator,
 ) -> None:
-    rate, window, rectified, reference_rate = LOGS[log]
+    rate, window, rectified, reference_rate = LOGS[log.removesuffix(AND_VOLTAGE)]
     width = round(window / period)
-    current = np.abs(signals[:, 1]) if rectified else signals[:, 1]
-    total = np.concatenate([np.zeros(width), np.cumsum(current)])
-    current = (total[width:] - total[:-width]) / width
+    current = _averaged(np.abs(signals[:, 1]) if rectified else signals[:, 1], width)
     at = np.arange(int(reference.size * period * rate)) / rate + 3e-4
     tick = np.minimum((at / period).astype(int), reference.size - 1)
     amperes = current[tick] + 0.005 * rng.standard_normal(tick.size)
@@ -292,8 +324,12 @@ def _write(
     events = [(float(a), 0, float(v)) for a, v in zip(told, values, strict=True)]
     events += [(float(a), 1, float(v)) for a, v in zip(stamps, signals[tick, 0], strict=True)]
     events += [(float(a), 2, float(v)) for a, v in zip(stamps, amperes, strict=True)]
+    topics = [("reference_position", FLOAT), ("motor/state", JOINTS), ("motor/current", FLOAT)]
+    if log.endswith(AND_VOLTAGE):
+        volts = signals[tick, 2] + 0.005 * rng.standard_normal(tick.size)
+        events += [(float(a), 3, float(v)) for a, v in zip(stamps, volts, strict=True)]
+        topics.append(("motor/voltage", FLOAT))
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topics = (("reference_position", FLOAT), ("motor/state", JOINTS), ("motor/current", FLOAT))
         to = [writer.add_connection(f"/hannes/{t}", kind.__msgtype__, typestore=STORE) for t, kind in topics]
         none = np.zeros(0)
         for a, which, value in sorted(events):
@@ -357,6 +393,7 @@ def main() -> int:
     which.add_argument("--full-hand", action="store_true", help="closures of the full hand, undescribed")
     which.add_argument("--lugre", action="store_true", help="the hand of bristles instead of the other one")
     which.add_argument("--wound", action="store_true", help="both, resting off their open stop")
+    which.add_argument("--voltage", action="store_true", help="recordings that have the motor's voltage too")
     parser.add_argument("--out", type=Path, default=Path("out/foreign"), help="folder of the kept results")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -366,6 +403,8 @@ def main() -> int:
         todo = lugre_cases()
     elif options.wound:
         todo = wound_cases()
+    elif options.voltage:
+        todo = voltage_cases()
     else:
         todo = cases(options.tuning)
     runs = Parallel(n_jobs=options.jobs, return_as="generator")(

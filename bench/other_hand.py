@@ -69,6 +69,9 @@ class Hand(NamedTuple):
     spot: float = 0.0
     spot_at: float = 7.0
     drag: float = 0.0
+    brush: float = 0.0
+    source: float = 0.0
+    saturation: float = 0.0
 
 
 def reference(period: float) -> Array:
@@ -88,13 +91,15 @@ def _rates(s: Any, u: float, h: Any) -> Any:
     friction += h.stiction * math.exp(-((v / h.stiction_speed) ** 2))
     friction += h.asymmetry * max(direction, 0.0)
     friction += h.spot * math.exp(-(((q - h.spot_at) / 0.8) ** 2))
-    drive = h.efficiency * h.kt * h.ratio * i - friction * direction - h.viscous * v
+    kt = h.kt / (1.0 + h.saturation * i * i)
+    drive = h.efficiency * kt * h.ratio * i - friction * direction - h.viscous * v
     drive += -h.drag * v * abs(v) - h.ripple * math.sin(h.waves * q) - tension
     pull = tension - h.preload - h.spring * ql - h.load_friction * math.tanh(vl / (2.0 * h.blur))
     pull -= h.glove * max(ql, 0.0) ** h.glove_power
     pull = held(pull, ql, vl, h)
-    back = h.kt * h.ratio * v
+    back = kt * h.ratio * v
     motor = drive / (h.rotor * h.ratio * h.ratio)
+    u -= h.source * i * (u / h.voltage_max) ** 2 + h.brush * math.tanh(i / 0.01)
     return np.array([v, motor, vl, pull / h.load, (u - h.resistance * i - back) / h.inductance])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,9 @@ from hannes_lab.chance import chance
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.hide import make_set
-from hannes_lab.prepare import prepare
+from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.search import Search
-from hannes_lab.trials import make_trial
+from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import strength_of
 
 FEW = ("viscous_friction", "glove_stiffness", "wire_slack")
@@ -56,7 +57,7 @@ def test_an_error_in_one_signal_of_one_condition_is_not_lost_in_the_sum_over_all
     problem, k = search.problem, 2
     block, rows = problem.features.blocks[k], problem.features.slices[k]
     wave = np.zeros(problem.features.size)
-    wave[rows][: block.phase.size] = problem.rig.own_error(block, prepared.model)
+    wave[rows][: block.phase.size] = np.sqrt(np.diag(problem.rig.own_error([block], prepared.model)))
     wave = 3.0 * problem.whiten(wave)
     off = replace(null, fit=replace(null.fit, residual=wave, cost=float(wave @ wave)))
     assert off.fit.cost < limits.misfit, "in the sum it is small"
@@ -82,9 +83,51 @@ def test_the_noise_of_a_dynamometer_on_which_nothing_presses_is_no_error_of_the_
     blocks = [b for b in prepared.features.blocks if b.signal == "grip_force"]
     assert len(errors) == len(blocks) == 2 and max(errors) < OWN_ERROR_MOST
     for block in blocks:
-        own = float(prepared.rig.own_error(block, prepared.model).min())
+        own = math.sqrt(np.diag(prepared.rig.own_error([block], prepared.model)).min())
         mean = float(np.sqrt((block.measured.mean(axis=0) ** 2).mean()))
         assert mean > OWN_ERROR_MOST * own, "with the noise it would be"
+
+
+def undescribed(window: float = 0.0, without: str = "") -> list[Trial]:
+    """Closures of the reduced plant of which nothing is told, the voltage averaged over the `window` before it [s]."""
+    made, _ = make_set(Model.load(), [], seed=23, closures=4, conditions=("slow", "fast"), sensors="bench")
+    out = []
+    for recording in made:
+        trial = make_trial(recording)
+        time, volts = trial.signals["motor_voltage"]
+        fine = np.arange(0.0, 1.0, 0.05) * window
+        averaged = np.interp(time[:, None] - fine, time, volts).mean(axis=1)
+        signals = {n: v for n, v in trial.signals.items() if n not in ("grip_force", without)}
+        options = {k: v for k, v in trial.options.items() if k not in ("sensors", "plant")}
+        if "motor_voltage" in signals:
+            signals["motor_voltage"] = time, averaged
+        out.append(replace(trial, signals=signals, options=options))
+    return out
+
+
+def test_of_a_voltage_more_is_known_beside_current_and_position() -> None:
+    def own_error(prepared: Prepared) -> tuple[float, float]:
+        """Standard deviation of the voltage while a fast closure closes: of its mean over the phases, and of one."""
+        block = next(
+            b for b in prepared.features.blocks if (b.signal, b.condition) == ("motor_voltage", "fast")
+        )
+        covariance = prepared.rig.own_error([block], prepared.model)
+        moving = slice(block.phase.size // 4, block.phase.size // 2)
+        part = covariance[moving, moving]
+        return math.sqrt(part.mean()), math.sqrt(part.diagonal().mean())
+
+    beside, alone = (own_error(prepare(undescribed(without=w), Model.load())) for w in ("", "motor_current"))
+    assert beside[0] < 0.2 * alone[0], "what it is on the whole follows from R i + k w"
+    assert beside[1] > 2.0 * beside[0], "the speed may stray at once"
+
+
+@pytest.mark.parametrize("window", [0.0, 0.02])
+def test_a_voltage_that_was_averaged_is_seen_to_be(window: float) -> None:
+    prepared = prepare(undescribed(window), Model.load())
+    found = Search(prepared.problem, prepared.model, prepared.nuisances, {}).null().fit
+    assert found.values["log.voltage_window"] == pytest.approx(window, abs=3e-3)
+    errors = prepared.problem.own_errors(found.residual)
+    assert max(error for _, error in errors) < 0.5
 
 
 def test_to_its_own_plant_a_model_has_no_error_of_its_own() -> None:

@@ -252,8 +252,6 @@ def command(
     """Identify named parameters of your hand from recorded closures, with intervals and warnings."""
     names = [n.strip() for n in free.split(",") if n.strip()]
     check_model_file(out)
-    if not out.resolve().parent.is_dir():
-        raise HannesError(f"--out {out}: the folder '{out.resolve().parent}' does not exist.")
     sds = {}
     for text in prior or ():
         name, _, value = text.partition("=")

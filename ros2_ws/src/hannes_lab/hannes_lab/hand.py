@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -86,6 +87,9 @@ _APART = 4.0
 recording is no explanation, however well it fits."""
 
 CURRENT_WINDOW = "log.current_window"
+VOLTAGE_WINDOW = "log.voltage_window"
+"""Over which a logger that nobody described averages, s: the current about half of its sampling, the voltage, which
+many log as it was commanded last, from nothing to about one sampling."""
 
 SIGNAL_DELAY = "log.delay_of_"
 """Beginning of the name of how much later a signal is, s, that was by another clock and moved to that of the others."""
@@ -97,6 +101,12 @@ OWN_ERROR: Mapping[str, float] = {"encoder_position": 0.0022}
 OWN_ERROR_DRIVE = 0.015
 """Of a signal's span: how far the form of the model may be from that of a hand that is not this simulator's.  The loop
 holds the position; what the model does not know shows in what drives it."""
+
+OWN_ERROR_ELECTRIC = 0.001
+"""Of its span: how far a voltage beside current and position may be from R i + k w."""
+
+OWN_ERROR_LENGTH = 0.1
+"""Part of a closure over which that stays alike."""
 
 RESTING = 0.05
 AT_REST = 10.0
@@ -297,10 +307,10 @@ class HandRig(PlantRig):
         ]
         if strange:
             out.append(Nuisance(HOMING, 0.0, _UNKNOWN_HOMING_SD, False, unit="rad", lower=0.0))
-        logged = [t.signals["motor_current"][0] for t in strange if "motor_current" in t.signals]
-        if logged:
-            step = float(np.median(np.diff(logged[0])))
+        if (step := _sampling(strange, "motor_current")) is not None:
             out.append(Nuisance(CURRENT_WINDOW, 0.5 * step, 1.0, True, unit="s"))
+        if (step := _sampling(strange, "motor_voltage")) is not None:
+            out.append(Nuisance(VOLTAGE_WINDOW, 0.0, step, False, unit="s", lower=0.0))
         out += [
             Nuisance(f"{REFERENCE_DELAY}@{t.name}", delay, REFERENCE_DELAY_SD, False, unit="s", apart=_APART)
             for t in strange
@@ -312,23 +322,58 @@ class HandRig(PlantRig):
         ]
         return out
 
-    def own_error(self, block: Block, model: Model) -> Array:
-        """See Rig: none for a recording of this plant, as its description says."""
+    def own_error(self, blocks: Sequence[Block], model: Model) -> Array:
+        """See Rig: none for a recording of this plant, as its description says.
+
+        Else each signal strays by itself, but for a voltage beside current and position: R i + k w holds whatever the
+        hand does, so it strays with the current, and by as much as a position may from one moment to the next.
+        """
+        sizes = [block.phase.size for block in blocks]
+        out = np.zeros((sum(sizes),) * 2)
+        if is_of(self.trials[blocks[0].trial], model):
+            return out
+        strays = [self._strays(block, model) for block in blocks]
+        larger = np.concatenate([np.where(self._rests(block), AT_REST, 1.0) for block in blocks])
+        ends = np.cumsum([0, *sizes])
+        length = OWN_ERROR_LENGTH * float(np.ptp(blocks[0].phase))
+        for k, m in itertools.product(range(len(blocks)), repeat=2):
+            part = out[ends[k] : ends[k + 1], ends[m] : ends[m + 1]]
+            for source in strays[k].keys() & strays[m].keys():
+                alike = np.exp(-np.abs(blocks[k].phase[:, None] - blocks[m].phase) / length)
+                part += strays[k][source] @ alike @ strays[m][source].T
+        return larger[:, None] * out * larger
+
+    def _strays(self, block: Block, model: Model) -> dict[str, Array]:
+        """How errors of standard deviation 1 make up that of a block: (p, p) by what strays."""
+        trial, p, whole = self.trials[block.trial], model.parameters, np.eye(block.phase.size)
+        if block.signal != "motor_voltage" or not {"motor_current", "encoder_position"} <= set(trial.signals):
+            return {
+                block.signal: OWN_ERROR.get(block.signal, OWN_ERROR_DRIVE) * _span(block.measured) * whole
+            }
+        rate = np.asarray(np.gradient(whole, block.phase, axis=0))
+        volts = block.measured.mean(axis=0)
+        amperes, angle = (
+            _span(_during(trial, block.condition, name)) for name in ("motor_current", "encoder_position")
+        )
+        sign = np.sign(volts) if self._sensors[trial.name]["rectified"] else np.ones(volts.size)
+        ohms, turns = p.value("motor.resistance"), p.value("motor.kt") * p.value("gear.ratio")
+        return {
+            "motor_current": ohms * OWN_ERROR_DRIVE * amperes * np.diag(sign),
+            "speed": turns * OWN_ERROR["encoder_position"] * angle * rate,
+            "motor_voltage": OWN_ERROR_ELECTRIC * _span(volts) * whole,
+        }
+
+    def _rests(self, block: Block) -> NDArray[np.bool_]:
+        """(p,) where reference or encoder is close to its rest."""
         trial = self.trials[block.trial]
-        if is_of(trial, model):
-            return np.zeros(block.phase.size)
-        span = float(np.ptp(block.measured)) or 1.0
-        sd = np.full(block.phase.size, OWN_ERROR.get(block.signal, OWN_ERROR_DRIVE) * span)
-        closure = trial.of(block.condition)[0]
-        at = closure.start + block.phase
+        at = trial.of(block.condition)[0].start + block.phase
         near = RESTING * trial.span
         rest = float(np.median(trial.reference[[0, -1]]))
         ticks = np.arange(trial.reference.size) * trial.period
         resting = np.abs(np.interp(at, ticks, trial.reference) - rest) < near
         if "encoder_position" in trial.signals:
             resting |= np.abs(np.interp(at, *trial.signals["encoder_position"]) - rest) < near
-        sd[resting] *= AT_REST
-        return sd
+        return resting
 
     def comes_back(self, model: Model, trial: Trial) -> float:
         """See PlantRig; of another machine the model's position is known no better than its own error says."""
@@ -376,8 +421,13 @@ class HandRig(PlantRig):
         self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array
     ) -> dict[str, Array]:
         """See PlantRig."""
-        window = None if is_described(trial) else values.get(CURRENT_WINDOW)
+        strange = not is_described(trial)
+        window = values.get(CURRENT_WINDOW) if strange else None
         signals = self.logged(self.run(model, values, trial, reference), trial, window)
+        if strange and values.get(VOLTAGE_WINDOW):
+            signals["motor_voltage"] = moving_mean(
+                signals["motor_voltage"], 1.0 + values[VOLTAGE_WINDOW] / trial.period
+            )
         for name in trial.options.get(MOVED, ()):
             signals[name] = later(signals[name], values.get(SIGNAL_DELAY + name, 0.0) / trial.period)
         return signals
@@ -402,6 +452,24 @@ class HandRig(PlantRig):
             "grip_force": run.grip_force,
             "motor_effort": run.motor_effort,
         }
+
+
+def _span(values: Array) -> float:
+    return float(np.ptp(values)) or 1.0
+
+
+def _during(trial: Trial, condition: str, signal: str) -> Array:
+    """Values of a signal during the closures of a condition."""
+    time, values = trial.signals[signal]
+    closures = trial.of(condition)
+    during: Array = values[(time >= closures[0].start) & (time <= closures[-1].stop)]
+    return during
+
+
+def _sampling(trials: Sequence[Trial], signal: str) -> float | None:
+    """The time between two samples of a signal [s]; None if it was not recorded."""
+    logged = next((t.signals[signal][0] for t in trials if signal in t.signals), None)
+    return None if logged is None else float(np.median(np.diff(logged)))
 
 
 class OuterLoop(NamedTuple):

@@ -35,9 +35,6 @@ Array = NDArray[np.float64]
 Part = tuple[NDArray[np.int64], Array]
 """Rows of the features, and a Cholesky factor of a covariance of them."""
 
-DISCREPANCY_LENGTH = 0.1
-"""Part of a closure over which the model's own error stays alike."""
-
 CHANCE = 2.0
 """Standard deviations above its mean that noise may make the sum of squares of a signal without being an error."""
 
@@ -346,7 +343,7 @@ def build_problem(
             else np.zeros((sum(variances[k].size for k in own), 0))
         )
         single = _covariance_of_one(features, own, variances, deviations, jacobian)
-        form = _own_error([features.blocks[k] for k in own], rig, model)
+        form = rig.own_error([features.blocks[k] for k in own], model)
         for part in _parts(features, own):
             covariance = single[part.ix] / np.maximum.outer(part.count, part.count)
             own_error = np.outer(part.share, part.share) * form[part.ix]
@@ -384,20 +381,6 @@ def _covariance_of_one(
         e = np.concatenate([deviations[k] for k in full], axis=1)
         power, v[told] = _estimate_scatter(e, jacobian[told], v[told])
     return np.asarray(np.diag(v) + (jacobian * power) @ jacobian.T)
-
-
-def _own_error(blocks: Sequence[Block], rig: Rig, model: Model) -> Array:
-    """Covariance of the model's own error over the phases of these blocks, one after another; zero if it has none."""
-    out = np.zeros((sum(b.phase.size for b in blocks),) * 2)
-    at = 0
-    for block in blocks:
-        sd = rig.own_error(block, model)
-        length = DISCREPANCY_LENGTH * float(block.phase[-1] - block.phase[0])
-        apart = np.abs(block.phase[:, None] - block.phase[None, :]) / length
-        own = slice(at, at + block.phase.size)
-        out[own, own] = sd[:, None] * np.exp(-apart) * sd
-        at += block.phase.size
-    return out
 
 
 def _pooled(features: Features, variances: Sequence[Array]) -> list[Array]:

@@ -131,8 +131,9 @@ class Rig(Protocol):
     def nuisances(self, model: Model) -> Sequence[Nuisance]:
         """The uncertain nominal parameters with their priors."""
 
-    def own_error(self, block: Block, model: Model) -> Array:
-        """Standard deviation (p,) of the model's own error over the phases of a block, in the signal's unit.
+    def own_error(self, blocks: Sequence[Block], model: Model) -> Array:
+        """Covariance (p, p) of the model's own error over the phases of the blocks of one recording and condition, one
+        after another, in the signals' units.
 
         No model has exactly the machine's form: so far the best parameters may leave it.  0: any difference counts.
         """
@@ -252,9 +253,9 @@ class PlantRig:
             return Nuisance(name, mean, sd * mean, False, scatter * mean, unit, lower=LEAST * mean)
         return Nuisance(name, mean, sd, relative, scatter, unit)
 
-    def own_error(self, block: Block, model: Model) -> Array:
+    def own_error(self, blocks: Sequence[Block], model: Model) -> Array:
         """See Rig."""
-        return np.zeros(block.phase.size)
+        return np.zeros((sum(block.phase.size for block in blocks),) * 2)
 
     def effect(self, kind: EffectType) -> EffectType:
         """See Rig."""

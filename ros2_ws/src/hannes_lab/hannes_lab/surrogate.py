@@ -135,9 +135,9 @@ class AnchoredRig:
         """See Rig."""
         return self.exact.nuisances(model)
 
-    def own_error(self, block: Block, model: Model) -> Array:
+    def own_error(self, blocks: Sequence[Block], model: Model) -> Array:
         """See Rig."""
-        return self.exact.own_error(block, model)
+        return self.exact.own_error(blocks, model)
 
     def effect(self, kind: EffectType) -> EffectType:
         """See Rig."""
