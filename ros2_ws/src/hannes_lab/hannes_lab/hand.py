@@ -102,7 +102,7 @@ OWN_ERROR_DRIVE = 0.015
 """Of a signal's span: how far the form of the model may be from that of a hand that is not this simulator's.  The loop
 holds the position; what the model does not know shows in what drives it."""
 
-OWN_ERROR_ELECTRIC = 0.001
+OWN_ERROR_ELECTRIC = 0.0022
 """Of its span: how far a voltage beside current and position may be from R i + k w."""
 
 OWN_ERROR_LENGTH = 0.1
@@ -359,7 +359,8 @@ class HandRig(PlantRig):
         ohms, turns = p.value("motor.resistance"), p.value("motor.kt") * p.value("gear.ratio")
         return {
             "motor_current": ohms * OWN_ERROR_DRIVE * amperes * np.diag(sign),
-            "speed": turns * OWN_ERROR["encoder_position"] * angle * rate,
+            # The position's own error counts in the position already: here it counts half.
+            "speed": math.sqrt(2.0) * turns * OWN_ERROR["encoder_position"] * angle * rate,
             "motor_voltage": OWN_ERROR_ELECTRIC * _span(volts) * whole,
         }
 
