@@ -117,7 +117,7 @@ def test_of_a_voltage_more_is_known_beside_current_and_position() -> None:
         return math.sqrt(part.mean()), math.sqrt(part.diagonal().mean())
 
     beside, alone = (own_error(prepare(undescribed(without=w), Model.load())) for w in ("", "motor_current"))
-    assert beside[0] < 0.2 * alone[0], "what it is on the whole follows from R i + k w"
+    assert beside[0] < 0.3 * alone[0], "what it is on the whole follows from R i + k w"
     assert beside[1] > 2.0 * beside[0], "the speed may stray at once"
 
 
