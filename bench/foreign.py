@@ -296,13 +296,6 @@ def record(case: Case, folder: Path) -> None:
         _write(folder / name, commanded, signals, simulator.TICK, case.log, rng)
 
 
-def _averaged(values: np.ndarray, width: int) -> np.ndarray:
-    """Mean (n,) over the last `width` values; before the first they were zero."""
-    total = np.concatenate([np.zeros(width), np.cumsum(values)])
-    mean: np.ndarray = (total[width:] - total[:-width]) / width
-    return mean
-
-
 def _write(
     folder: Path,
     reference: np.ndarray,
@@ -313,7 +306,9 @@ def _write(
 ) -> None:
     rate, window, rectified, reference_rate = LOGS[log.removesuffix(AND_VOLTAGE)]
     width = round(window / period)
-    current = _averaged(np.abs(signals[:, 1]) if rectified else signals[:, 1], width)
+    current = np.abs(signals[:, 1]) if rectified else signals[:, 1]
+    total = np.concatenate([np.zeros(width), np.cumsum(current)])
+    current = (total[width:] - total[:-width]) / width
     at = np.arange(int(reference.size * period * rate)) / rate + 3e-4
     tick = np.minimum((at / period).astype(int), reference.size - 1)
     amperes = current[tick] + 0.005 * rng.standard_normal(tick.size)

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,6 +123,25 @@ def test_of_a_voltage_more_is_known_beside_current_and_position() -> None:
     beside, alone = (own_error(prepare(undescribed(without=w), Model.load())) for w in ("", "motor_current"))
     assert beside[0] < 0.3 * alone[0], "what it is on the whole follows from R i + k w"
     assert beside[1] > 2.0 * beside[0], "the speed may stray at once"
+
+
+def test_the_own_error_is_the_same_to_the_last_digit_in_every_process() -> None:
+    """Results are kept under a hash of it; the order of a set of names differs from process to process."""
+    printed = set()
+    for seed in ("1", "2"):
+        code = (
+            "from lab.test_other_plant import *; p = prepare(undescribed(), Model.load()); "
+            "blocks = [b for b in p.features.blocks if b.condition == 'fast']; "
+            "print(p.rig.own_error(blocks, p.model).tobytes().hex())"
+        )
+        paths = [str(Path(__file__).parents[1]), *filter(None, sys.path)]
+        environment = os.environ | {"PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(paths)}
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+        printed.add(done.stdout)
+    assert len(printed) == 1
 
 
 @pytest.mark.parametrize("window", [0.0, 0.02])

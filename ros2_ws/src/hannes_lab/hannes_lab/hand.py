@@ -338,8 +338,9 @@ class HandRig(PlantRig):
         length = OWN_ERROR_LENGTH * float(np.ptp(blocks[0].phase))
         for k, m in itertools.product(range(len(blocks)), repeat=2):
             part = out[ends[k] : ends[k + 1], ends[m] : ends[m + 1]]
-            for source in strays[k].keys() & strays[m].keys():
-                alike = np.exp(-np.abs(blocks[k].phase[:, None] - blocks[m].phase) / length)
+            alike = np.exp(-np.abs(blocks[k].phase[:, None] - blocks[m].phase) / length)
+            # In one order, whatever the process: what is kept is found again by the sum's last digit.
+            for source in (s for s in strays[k] if s in strays[m]):
                 part += strays[k][source] @ alike @ strays[m][source].T
         return larger[:, None] * out * larger
 
