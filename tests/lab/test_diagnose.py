@@ -460,6 +460,7 @@ def test_an_error_that_rises_is_said_to_rise() -> None:
         fall("gravity", 4.5, {"slow": 1.0, "fast": 6.0}),
     )
     assert "falls from 4.00 (nominal, fitted) to 2.00 times" in fall_sentence([*steps, better])
+    assert fall_sentence(steps) == "The error on held-out closures is 4.00 times the repeatability."
     said = fall_sentence([*steps, worse])
     assert "rises from 4.00 (nominal, fitted) to 4.50 times" in said
     assert "'slow' from 3.00 to 1.00, 'fast' from 5.00 to 6.00" in said

@@ -92,6 +92,25 @@ def test_the_noise_of_a_dynamometer_on_which_nothing_presses_is_no_error_of_the_
         assert mean > OWN_ERROR_MOST * own, "with the noise it would be"
 
 
+def test_who_says_how_another_machine_was_logged_says_no_more_of_it() -> None:
+    """Its gains are its own, though the loggers are those that the recordings name."""
+    gains = {"control.kp": 0.46, "control.damping": 0.026}
+    hand = Model.load().with_values({"friction.coulomb": 0.018, **gains})
+    made, _ = make_set(hand, [], seed=23, closures=5, conditions=("slow", "fast"))
+    for said in ({"plant": "my_simulator"}, {}):
+        metadata = [{k: v for k, v in one.metadata.items() if k != "plant"} | said for one in made]
+        recordings = [replace(one, metadata=meta) for one, meta in zip(made, metadata, strict=True)]
+        trials = [make_trial(one) for one in recordings]
+        prepared = prepare(trials, Model.load())
+        assert "log.current_window" not in {n.name for n in prepared.nuisances}
+        found = Search(prepared.problem, prepared.model, prepared.nuisances, {}).null().fit
+        assert {n: found.values[n] for n in gains} == pytest.approx(gains, rel=0.15)
+        # A third less dry friction is within what a hand that is not this simulator's may have; as much more is not.
+        z = found.z_of("friction.coulomb")
+        assert z is not None and -2.0 < z < -0.5
+        assert max(error for _, error in prepared.problem.own_errors(found.residual)) < 0.5
+
+
 def undescribed(window: float = 0.0, without: str = "") -> list[Trial]:
     """Closures of the reduced plant of which nothing is told, the voltage averaged over the `window` before it [s]."""
     made, _ = make_set(Model.load(), [], seed=23, closures=4, conditions=("slow", "fast"), sensors="bench")

@@ -11,7 +11,8 @@ from hannes_lab.errors import split_closures
 from hannes_lab.features import Block, Features
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
-from hannes_lab.problem import Problem, build_problem
+from hannes_lab.problem import Problem, build_problem, nuisance_coordinate
+from hannes_lab.rig import Nuisance
 from hannes_lab.trials import make_trial
 
 NOISE = 0.03
@@ -99,3 +100,10 @@ def test_two_recordings_of_one_condition_have_closures_of_their_own(prepared: Pr
         draws[both.slices[k].start : both.slices[k].start + first[0].phase.size] for k in (0, len(one.blocks))
     ]
     assert abs(np.corrcoef(mean[0].ravel(), mean[1].ravel())[0, 1]) < 0.05
+
+
+def test_a_tolerance_may_be_wider_downwards() -> None:
+    c = nuisance_coordinate(Nuisance("friction", 2.0, 0.2, False, unit="N.m", lower=0.02, below=0.6))
+    assert [c.value(z) for z in (-2.0, -1.0, 0.0, 1.0)] == pytest.approx([0.8, 1.4, 2.0, 2.2])
+    assert all(c.z(c.value(z)) == pytest.approx(z) for z in (-3.0, -0.1, 0.0, 0.1, 3.0))
+    assert c.bounds == (pytest.approx(-3.3), np.inf)

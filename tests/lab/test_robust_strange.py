@@ -16,7 +16,7 @@ from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.executor import Executor
 from hannes_lab.features import compact_end
-from hannes_lab.fit import Fit
+from hannes_lab.fit import Fit, fit
 from hannes_lab.grasp import Curve, _seen, with_seen_objects
 from hannes_lab.hand import HandRig, outer_loop
 from hannes_lab.hide import make_set
@@ -121,6 +121,30 @@ def test_a_strange_hand_may_rest_off_its_open_stop(tmp_path: Path) -> None:
         note for note in diagnose(prepared, effect_sources(only=["gravity"])).notes if "do not tell" in note
     )
     assert "encoder.homing" in said and "control.kp" in said
+
+
+def test_where_an_object_is_does_not_depend_on_the_homing(tmp_path: Path) -> None:
+    """Its place is what the encoder shows there: else a fit that moves the homing loses the object."""
+    prepared = prepare(strange_set(tmp_path), Model.load())
+    trial = next(t for t in prepared.rig.trials if t.name == "grasp")
+    rig, values = prepared.rig, {n.name: n.mean for n in prepared.nuisances}
+
+    def touched(homing: float) -> float:
+        run = rig.run(prepared.model, {**values, "encoder.homing": homing}, trial, trial.reference)
+        return float(run.encoder_position[np.argmax(run.grip_force > 0.0)])
+
+    places = [touched(homing) for homing in (0.0, 1.0, 2.0)]
+    assert np.ptp(places) < 0.05 and places[0] == pytest.approx(values["object.position@grasp"], abs=0.1)
+
+
+def test_a_fit_of_a_hand_off_its_stop_is_led_back_to_one_on_it(tmp_path: Path) -> None:
+    prepared = prepare(strange_set(tmp_path), Model.load())
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, {})
+    begin = {"encoder.homing": 3.0, "hand.preload": -6.0}
+    off = fit(search.problem, search.model, search.coordinates, begin)
+    back = search._led_back(off)
+    assert off.values["encoder.homing"] > 1.5, "the fit comes back by itself, and shows nothing"
+    assert back.values["encoder.homing"] < 0.5 and back.cost < 0.9 * off.cost
 
 
 @pytest.mark.slow

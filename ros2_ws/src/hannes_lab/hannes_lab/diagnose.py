@@ -339,6 +339,10 @@ def found_effects(
     return tuple(_found(search, best.fit, name, intervals, at_end, falls) for name in best.names)
 
 
+SEEN = 0.95
+"""Part of an error, root mean square, that an effect must leave at most for a sentence to say what it explains."""
+
+
 def _found(
     search: Search,
     best: Fit,
@@ -359,10 +363,12 @@ def _found(
     step = next((k for k, f in enumerate(falls) if f.added == name), len(falls) - 1)
     pairs = zip(falls[step - 1].signals, falls[step].signals, strict=True)
     b, s = min(pairs, key=lambda pair: _change(*pair))
-    why = (
-        f"Without it the model misses {s.signal} in '{s.condition}' by {_missed(b)}, with it by {_missed(s)}. What it "
-        f"looks like: {kind.looks_like}."
+    missed = (
+        f"Without it the model misses {s.signal} in '{s.condition}' by {_missed(b)}, with it by {_missed(s)}."
+        if s.rmse < SEEN * b.rmse
+        else "No signal of any condition is missed by much less with it than without."
     )
+    why = f"{missed} What it looks like: {kind.looks_like}."
     return FoundEffect(name, kind.title, effect_source(kind, search.sources[name]), parameters, why)
 
 

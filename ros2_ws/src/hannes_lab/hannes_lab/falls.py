@@ -24,6 +24,9 @@ from .search import Candidate, Search, key_of
 from .settle import slopes_at
 from .surrogate import exact_rig
 
+WITHOUT_EFFECT = 2
+"""Steps of an error that falls before the first effect: the nominal model as given, and fitted."""
+
 NO_REPEATS = "No condition was repeated: there is no repeatability to hold the error against."
 
 
@@ -116,11 +119,15 @@ def worth_showing(
 def fall_sentence(falls: Sequence[Fall]) -> str:
     """How the error on held-out closures falls, or that it does not; in the signals' units where nothing was repeated.
 
+    Where no effect was added, what it is.
+
     A fit weighs what is known of the model's own error; the error does not.
     """
     before, after = falls[1].held_out, falls[-1].held_out
     if not np.isfinite([before, after]).all():
         return f"{NO_REPEATS} {_in_units(falls)}".rstrip()
+    if len(falls) == WITHOUT_EFFECT:
+        return f"The error on held-out closures is {after:.2f} times the repeatability."
     verb = "falls" if after <= before else "rises"
     said = (
         f"The error on held-out closures {verb} from {before:.2f} (nominal, fitted) to {after:.2f} times the "

@@ -59,6 +59,7 @@ class Coordinate:
     scale    value = offset + scale z, or offset exp(scale z) if log
     part     True for a part of a whole
     form     True for a shape of an effect of which a usual value is known
+    below    scale of z below 0, if it is another (not if log); 0: it is not
     """
 
     name: str
@@ -72,6 +73,7 @@ class Coordinate:
     unit: str = ""
     part: bool = False
     form: bool = False
+    below: float = 0.0
 
     @property
     def nuisance(self) -> bool:
@@ -83,17 +85,24 @@ class Coordinate:
         """True for a nuisance parameter with a wide prior: its step, in standard deviations, is a small one."""
         return self.prior and self.step < Nuisance.step
 
+    def scale_at(self, z: float) -> float:
+        """What a unit of z is at z: of the value, or of its logarithm."""
+        return self.below if self.below and z < 0.0 else self.scale
+
     def value(self, z: float) -> float:
         # A step of the search may go to where no number is; the bounds bring it back.
-        raw = self.offset * math.exp(min(self.scale * z, 700.0)) if self.log else self.offset + self.scale * z
+        raw = (
+            self.offset * math.exp(min(self.scale * z, 700.0))
+            if self.log
+            else self.offset + self.scale_at(z) * z
+        )
         return min(max(raw, self.lower), self.upper)
 
     def z(self, value: float) -> float:
-        return (
-            float(np.log(value / self.offset)) / self.scale
-            if self.log
-            else (value - self.offset) / self.scale
-        )
+        if self.log:
+            return float(np.log(value / self.offset)) / self.scale
+        away = value - self.offset
+        return away / self.scale_at(away)
 
     def inside_step(self, z: float, wanted: float | None = None) -> float:
         """Step of a finite difference at z that stays inside the bounds; of the usual length, or as wanted."""
@@ -139,6 +148,7 @@ def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
         True,
         nuisance.step,
         nuisance.unit,
+        below=nuisance.below,
     )
 
 
@@ -329,7 +339,7 @@ def build_problem(
             except PlantDiverged:
                 continue
             # sensitivity to one standard deviation of the closure-to-closure scatter
-            factor = nuisance.closure_sd / nuisance.sd / step
+            factor = nuisance.closure_sd / c.scale_at(here) / step
             columns.append([(m - b).mean(axis=0) * factor for m, b in zip(moved, base, strict=True)])
             break
 

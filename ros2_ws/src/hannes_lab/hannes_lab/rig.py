@@ -64,6 +64,7 @@ class Nuisance:
     apart        sd that the one of a recording may be from the mean over all recordings; beyond, no set of effects is
                  adequate
     effect       effect of the catalogue that is the same thing, if there is one: a value that is far off is that effect
+    below        standard deviation of values less than the mean, on a linear scale, if it is another; 0: it is not
     """
 
     name: str
@@ -76,6 +77,7 @@ class Nuisance:
     lower: float = -math.inf
     apart: float = math.inf
     effect: str = ""
+    below: float = 0.0
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.sd) and self.sd > 0.0):

@@ -114,6 +114,9 @@ PULLED = 4.0
 """Where a nuisance parameter of a base is so many standard deviations off, all extensions of it are approached: it may
 have taken over an effect, which a scan does not see."""
 
+GROWN = 1.5
+"""The same of a parameter that nobody described and that only grows from nothing."""
+
 STEPS = (2.0, 0.5)
 """Other lengths of the steps of a refit's derivatives, in multiples of the usual ones."""
 
@@ -413,13 +416,15 @@ class Search:
         """A fit with parameters that are far off held at their nominal values and all else fitted again, where that
         costs less; a slow plant's stays as it is.  Those of a recording alone may lie across the way too.
 
-        Parameters that only act together (an efficiency, and the mass and friction that it drives) are told by their
-        priors alone.  While much is unexplained, a fit stays where that of a worse model had gone: what is bent or
-        rough in the derivatives makes the valley look like a slope.  With one of them held there is no valley.
+        Those that only grow from nothing are tried from nearer on: a hand that rests off its stop may look like one
+        that rests on it.  Parameters that only act together (an efficiency, and the mass and friction that it drives)
+        are told by their priors alone.  While much is unexplained, a fit stays where that of a worse model had gone:
+        what is bent or rough in the derivatives makes the valley look like a slope.  With one of them held there is no
+        valley.
         """
         tried: set[str] = set()
         while not self.slow:
-            far = [c for c, off in found.off if off > PULLED]
+            far = [c for c, off in found.off if off > (GROWN if grows(c) else PULLED)]
             held = next((c for c in far if c.name not in tried), None)
             if held is None:
                 break
@@ -795,6 +800,11 @@ def _derivatives(found: Fit, of: Sequence[Coordinate] | None = None) -> dict[str
     return {c.name: found.jacobian[:, j] for j, c in enumerate(found.coordinates) if of is None or c in of}
 
 
+def grows(c: Coordinate) -> bool:
+    """True for a parameter that nobody described and that only grows from nothing."""
+    return c.wide and c.bounds[0] == 0.0
+
+
 def wide_starts(coordinates: Sequence[Coordinate]) -> list[dict[str, float]]:
     """Where fits of the model as it is start: the nominal values, and others if some priors are wide.
 
@@ -802,7 +812,7 @@ def wide_starts(coordinates: Sequence[Coordinate]) -> list[dict[str, float]]:
     misfit may say that it should shrink.
     """
     wide = [c.name for c in coordinates if c.wide]
-    grown = [{c.name: 1.0} for c in coordinates if c.wide and c.bounds[0] == 0.0]
+    grown = [{c.name: 1.0} for c in coordinates if grows(c)]
     others = np.random.default_rng(0).uniform(-APART, APART, (STARTS if wide else 0, len(wide)))
     return [{}, *grown, *(dict(zip(wide, (float(z) for z in row), strict=True)) for row in others)]
 

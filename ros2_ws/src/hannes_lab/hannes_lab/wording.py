@@ -67,13 +67,8 @@ def summary(
         if not other and choice.adequate and choice.ranking:
             some = f"none of {_listed(only)}" if only else "no effect of the catalogue"
             other = f", and {some} gains more than chance would"
-        held = (
-            f"The error on held-out closures is {falls[-1].held_out:.2f} times the repeatability."
-            if np.isfinite(falls[-1].held_out)
-            else fall
-        )
         nearest = "" if choice.idle else nearest_sentence(choice)
-        return f"Nothing is missing: with its own parameters fitted, {explained}{other}. {held}{far and far + nearest}"
+        return f"Nothing is missing: with its own parameters fitted, {explained}{other}. {fall}{far and far + nearest}"
     names = " and ".join(e.title for e in effects)
     if verdict == "effects":
         tie = ""
