@@ -105,7 +105,7 @@ def test_who_says_how_another_machine_was_logged_says_no_more_of_it() -> None:
         assert "log.current_window" not in {n.name for n in prepared.nuisances}
         found = Search(prepared.problem, prepared.model, prepared.nuisances, {}).null().fit
         assert {n: found.values[n] for n in gains} == pytest.approx(gains, rel=0.15)
-        # A third less dry friction is within what a hand that is not this simulator's may have; as much more is not.
+        # A third less dry friction is within what a hand that is not this simulator's may have.
         z = found.z_of("friction.coulomb")
         assert z is not None and -2.0 < z < -0.5
         assert max(error for _, error in prepared.problem.own_errors(found.residual)) < 0.5

@@ -165,7 +165,7 @@ def _in_units(falls: Sequence[Fall]) -> str:
     old, new = steps[1], steps[-1]
     each = [
         f"{name} "
-        + (f"{new[name]:.3g}" if len(falls) < 3 else f"from {old[name]:.3g} to {new[name]:.3g}")
+        + (f"{new[name]:.3g}" if len(falls) == WITHOUT_EFFECT else f"from {old[name]:.3g} to {new[name]:.3g}")
         # a number without a dimension has no unit to name
         + (f" {units[name]}" if units.get(name, "1") != "1" else "")
         for name in new

@@ -14,7 +14,7 @@ from hannes_control.double_pid import DoublePID
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.parameters import data_path, read_yaml
-from hannes_sim.factory import PLANTS, make_plant
+from hannes_sim.factory import is_plant, make_plant
 from hannes_sim.measurement import Sensors, folded_mean, logger, sample_noise
 from hannes_sim.objects import GraspObject, named_object
 from hannes_sim.plant import Plant
@@ -174,8 +174,7 @@ def is_described(trial: Trial) -> bool:
     Then clocks, gains, homing and the named object are what they say.  Of any other recording (a real hand's, another
     simulator's) these are unknown, and fitted with wide priors.
     """
-    plant = str(trial.options.get("plant", ""))
-    return tells_logging(trial) and (plant in PLANTS or ":" in plant)
+    return tells_logging(trial) and is_plant(str(trial.options.get("plant", "")))
 
 
 def is_of(trial: Trial, model: Model) -> bool:
@@ -252,7 +251,7 @@ class HandRig(PlantRig):
 
     def nuisances(self, model: Model) -> list[Nuisance]:
         """Priors from population.yaml; object parameters per trial with an object, the encoder's zero per trial."""
-        out = []
+        out, other = [], self._of_others(model)
         for name, entry in read_yaml(Path(self.population), "population file").items():
             sd, scatter, relative = float(entry["hand_sd"]), float(entry["closure_sd"]), entry["unit"] == "1"
             if name in _PER_OBJECT:
@@ -290,9 +289,13 @@ class HandRig(PlantRig):
                 ]
             elif model.parameters.value(name) > 0.0:
                 own = self._nuisance(name, entry, model)
-                less = name in _DRY_FRICTION and not all(is_of(t, model) for t in self.trials)
+                less = other and name in _DRY_FRICTION
                 out.append(replace(own, below=LESS_FRICTION * own.mean) if less else own)
         return out + [replace(n, step=WIDE_STEP) for n in self._bench_nuisances(model)]
+
+    def _of_others(self, model: Model) -> list[Trial]:
+        """Recordings of another machine than the model's."""
+        return [trial for trial in self.trials if not is_of(trial, model)]
 
     def _bench_nuisances(self, model: Model) -> list[Nuisance]:
         """What is unknown of controller and logger where a recording does not describe them."""
@@ -315,7 +318,7 @@ class HandRig(PlantRig):
                 for name, sd in _UNKNOWN_GAINS.items()
                 if means.get(name, 0.0) > 0.0
             ]
-        other = [trial for trial in self.trials if not is_of(trial, model)]
+        other = self._of_others(model)
         known = self._plant(model.without_effects(), other[0])[0].names if other else ()
         out += [
             Nuisance(name, model.parameters.value(name), sd, True, unit=model.parameters[name].unit)

@@ -85,10 +85,6 @@ class Nuisance:
         if self.log and self.mean <= 0.0:
             raise HannesError(f"Nuisance '{self.name}': mean {self.mean} cannot be on a logarithmic scale.")
 
-    def value(self, z: float) -> float:
-        """The parameter's value at z standard deviations from its mean."""
-        return self.mean * math.exp(self.sd * z) if self.log else self.mean + self.sd * z
-
 
 COMES_BACK = 1e-4
 """Part of the reference's span within which a closure ends where the one before it did."""

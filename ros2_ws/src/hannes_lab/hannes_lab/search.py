@@ -115,7 +115,8 @@ PULLED = 4.0
 have taken over an effect, which a scan does not see."""
 
 GROWN = 1.5
-"""The same of a parameter that nobody described and that only grows from nothing."""
+"""A parameter is led back (`_led_back`) from PULLED on; one that nobody described and that only grows from nothing,
+from here on."""
 
 STEPS = (2.0, 0.5)
 """Other lengths of the steps of a refit's derivatives, in multiples of the usual ones."""

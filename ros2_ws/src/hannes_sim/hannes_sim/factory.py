@@ -14,6 +14,11 @@ from .plant import DEFAULT_DT, Plant
 PLANTS = ("reduced", "mujoco")
 
 
+def is_plant(name: str) -> bool:
+    """True for what a model file may name as its plant: one that ships, or a user's own `path.py:Class`."""
+    return name in PLANTS or ":" in name
+
+
 def make_plant(model: Model, grasp: GraspObject | None = None, *, dt: float | None = None) -> Plant:
     """The plant of a model: `reduced`, `mujoco`, or a user's own `path.py:Class` called with (model, grasp, dt=...)."""
     step = DEFAULT_DT if dt is None else dt
