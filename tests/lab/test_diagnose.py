@@ -357,7 +357,7 @@ def test_an_effect_outside_the_catalogue_is_called_unknown(tmp_path: Path) -> No
     file = tmp_path / "latch.py"
     file.write_text(OUTSIDE)
     prepared, _ = data([f"{file}:Flap"], seed=105, conditions=QUICK[1:])
-    found = diagnose(prepared, effect_sources(model=prepared.model), max_effects=2)
+    found = diagnose(prepared, effect_sources(model=prepared.model), max_effects=1)
     assert found.verdict == "unknown"
     assert "not in the catalogue" in found.summary
     assert {d.variable for d in found.depends_on} == {"position", "velocity", "direction", "load", "time"}

@@ -162,13 +162,11 @@ def test_the_damping_of_an_object_that_nobody_described_is_an_effect_where_it_is
 ) -> None:
     """As a parameter of the recording it charges less than an effect must gain."""
     damping = load_effect("object_damping").entry({"coefficient": 0.02})
-    three = ("slow", "fast", "grasp_soft")
-    conditions = signals_of_set(effects=[damping], conditions=three, closures=6, seed=11)
+    two = ("fast", "grasp_soft")
+    conditions = signals_of_set(effects=[damping], conditions=two, closures=6, seed=11)
     prepared = prepare(load_trials([write_set(tmp_path / "bags", conditions)]), Model.load())
     own = [n for n in prepared.nuisances if n.effect]
     assert [n.name for n in own] == ["object.damping@grasp_soft"]
-    fitted = Search(prepared.problem, prepared.model, prepared.nuisances, {}).null().fit
-    assert fitted.values[own[0].name] == pytest.approx(0.02, rel=0.5), "taken over"
 
     found = diagnose(prepared, effect_sources(only=["object_damping", "viscous_friction"]), max_effects=1)
     assert found.verdict == "effects" and [e.name for e in found.effects] == ["object_damping"]
@@ -176,21 +174,20 @@ def test_the_damping_of_an_object_that_nobody_described_is_an_effect_where_it_is
     assert own[0].name not in found.nuisances
     assert any(f"{own[0].name} would do the same" in note for note in found.notes)
     other = diagnose(prepared, effect_sources(only=["viscous_friction"]), max_effects=1)
-    assert other.verdict == "nothing" and own[0].name in other.nuisances, (
-        "no effect of that name is considered"
-    )
+    assert other.verdict == "nothing", "no effect of that name is considered"
+    assert other.nuisances[own[0].name]["value"] == pytest.approx(0.02, rel=0.5), "taken over"
 
 
 @pytest.mark.slow
 def test_a_slack_is_found_on_a_hand_of_half_the_friction(tmp_path: Path) -> None:
-    """The fit without it goes far off: six tolerances in friction, and as many in the spring's preload."""
+    """The fit without it goes far off: six tolerances in the spring's preload."""
     light = {"friction.coulomb": 0.012, "hand.coulomb": 0.005, "wire.stiffness": 5.0}
     light |= {"control.kp": 0.36, "control.damping": 0.02}
     slack = load_effect("wire_slack").entry({"slack": 1.0})
     conditions = signals_of_set(
         model=Model.load().with_values(light),
         effects=[slack],
-        conditions=("slow", "fast", "grasp"),
+        conditions=("fast", "grasp"),
         closures=6,
         seed=11,
         sensors="bench",
