@@ -1,8 +1,10 @@
 """Whether what a set of effects does is believed."""
 
+from dataclasses import replace
+
 import numpy as np
 from hannes_description.model import Model
-from hannes_lab.adequacy import distorted, leads_back
+from hannes_lab.adequacy import distorted, exaggerated, leads_back
 from hannes_lab.diagnose import effect_sources
 from hannes_lab.fit import Fit
 from hannes_lab.hand import WIDE_STEP
@@ -60,3 +62,23 @@ def test_an_effect_that_is_bent_into_another_one_explains_nothing() -> None:
         bent.startswith("cogging, of 1.5 waves in all, would be of another form")
         and "third_cosine -0.8" in bent
     )
+
+
+def test_no_effect_far_stronger_than_usual_is_believed_of_another_machine() -> None:
+    """A catch at one place (no catalogue) was a slack that ends there, beside a weight and a glove."""
+    recordings, _ = make_set(Model.load(), [], seed=5, closures=2, conditions=("slow",))
+    prepared = prepare([make_trial(r) for r in recordings], Model.load())
+    names = ("wire_slack", "glove_stiffness")
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, effect_sources(only=names))
+    of = {c.name: c for name in names for c in effect_coordinates(load_effect(name))}
+
+    def said(**values: float) -> str:
+        at = {f"wire_slack.{n}" if n == "slack" else f"glove_stiffness.{n}": v for n, v in values.items()}
+        found = candidate(*((of[name], of[name].z(value)) for name, value in at.items()))
+        return exaggerated(search, replace(found, names=names))
+
+    assert not said(slack=4.8), "of a recording of this very simulator an effect may be as strong as it fits"
+    search.problem.discrepancy = ((np.zeros(0, dtype=np.int64), np.zeros((0, 0))),)
+    assert not said(slack=3.9, stiffness=0.015)
+    assert said(slack=4.8).startswith("wire_slack.slack would be 4.8 rad, 10 times what is typical")
+    assert said(slack=0.5, stiffness=0.002, hardening=5e-5).startswith("glove_stiffness.hardening would be")

@@ -12,8 +12,10 @@ from hannes_description.model import EffectEntry, Model
 from hannes_lab.adequacy import is_adequate, shortfall
 from hannes_lab.calibrate import calibrate
 from hannes_lab.chance import chance
+from hannes_lab.compare import compare
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Diagnosis
+from hannes_lab.errors import overall, signal_errors
 from hannes_lab.executor import Executor
 from hannes_lab.features import compact_end
 from hannes_lab.fit import Fit, fit
@@ -154,6 +156,23 @@ def test_an_effect_is_found_on_a_strange_hand(tmp_path: Path) -> None:
     p = found.effects[0].parameters["coefficient"]
     assert p.value == pytest.approx(0.001, rel=0.25)
     assert found.ranking[0].names == ("viscous_friction",) and found.ranking[0].explained > 0.9
+
+
+def test_compare_fits_a_strange_hand_as_a_diagnosis_does(tmp_path: Path) -> None:
+    """From the nominal values alone a fit may end in a minimum of its own, worse than the model as it is."""
+    conditions = signals_of_set(
+        model=Model.load().with_values(STRANGE), conditions=("fast",), closures=4, seed=11
+    )
+    prepared = prepare(load_trials([write_set(tmp_path / "bags", conditions, late)]), Model.load())
+    starts = wide_starts([nuisance_coordinate(n) for n in prepared.nuisances])
+    assert len(starts) > 1, "little is known of it"
+    texts = set[str]()
+    fitted = compare(prepared, fitted=True, progress=lambda done, total, text: texts.add(f"{text} {total}"))
+    assert f"nominal: fit {len(starts)}" in texts
+    null = Search(prepared.problem, prepared.model, prepared.nuisances, {}).null().fit
+    expected = prepared.features.closures(prepared.rig, prepared.model, null.values)
+    assert fitted.overall == overall(signal_errors(prepared.features, expected))
+    assert fitted.overall < compare(prepared).overall
 
 
 @pytest.mark.slow

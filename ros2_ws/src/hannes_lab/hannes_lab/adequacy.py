@@ -24,6 +24,11 @@ IMPLAUSIBLE = 8.0
 """Standard deviations of its prior at which a nominal parameter is called far off, and beyond which no set of effects
 that needs it there is adequate: an effect may fit well whose only merit is that it replaces what the model had."""
 
+EXTREME = 8.0
+"""Typical strengths beyond which no effect is believed where the model has an error of its own: a set that has room to
+be wrong bends what it has into any curve (a slack of 40 % of the travel and a weight of nine times the usual, for a
+catch at that place)."""
+
 DISTORTED, WAVES = 2.5, 3.0
 """Standard deviations, root of the sum of the squares, that the shapes of a periodic effect may be off from what is
 usual of them where fewer than so many of its waves fit into the travel: bent further it stands for a curve that does
@@ -33,7 +38,7 @@ first.  Where not even one wave fits in, nothing repeats, and another machine's 
 
 def is_adequate(search: Search, candidate: Candidate, limits: Chance, room: float = ADEQUATE) -> bool:
     """Whether chance, with the model's own error if it has one, explains what a set leaves."""
-    if apart(search, candidate) or implausible(candidate) or distorted(search, candidate):
+    if disbelieved(search, candidate):
         return False
     if search.problem.discrepancy:
         return candidate.fit.cost <= limits.misfit and worst_error(search, candidate)[1] <= OWN_ERROR_MOST
@@ -72,6 +77,34 @@ def implausible(candidate: Candidate) -> str:
     return (
         f"{c.name} would be {candidate.fit.values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g}, {off:.0f} times "
         "its tolerance off: if the nominal model is not that of this machine, calibrate it first"
+    )
+
+
+def exaggerated(search: Search, candidate: Candidate) -> str:
+    """The effect that is stronger than EXTREME in recordings of another machine than the simulator's, in words; or
+    empty.
+    """
+    if not search.problem.discrepancy:
+        return ""
+    for effect in candidate.names:
+        for p in search.effect(effect).parameters:
+            name = f"{effect}.{p.name}"
+            strength = abs(candidate.fit.z_of(name) or 0.0)
+            if p.vanishing is not None and strength > EXTREME:
+                return (
+                    f"{name} would be {candidate.fit.values[name]:.3g} {p.unit}, {strength:.0f} times what is "
+                    "typical: it stands for something else"
+                )
+    return ""
+
+
+def disbelieved(search: Search, candidate: Candidate) -> str:
+    """Why a set is no answer whatever it explains, in words; empty if it may be one."""
+    return (
+        apart(search, candidate)
+        or implausible(candidate)
+        or distorted(search, candidate)
+        or exaggerated(search, candidate)
     )
 
 
@@ -122,7 +155,7 @@ def shortfall(search: Search, best: Candidate, limits: Chance) -> str:
     """In what a set that is not adequate falls short."""
     if best.fit.cost > limits.misfit:
         return f"misfit {best.fit.cost:.0f} stays above what chance reaches ({limits.misfit:.0f})"
-    if off := apart(search, best) or implausible(best) or distorted(search, best):
-        return off
+    if why := disbelieved(search, best):
+        return why
     where, error = worst_error(search, best)
     return f"error in {where} is {error:.1f} times as large as a model of this form is allowed to be off"

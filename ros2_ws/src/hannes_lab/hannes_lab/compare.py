@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from .depends import Dependence, residual_dependences
 from .errors import SignalError, overall, per_signal, signal_errors
+from .executor import Executor
 from .features import Block, Features, data_used
-from .fit import fit
 from .phases import METRICS, PHASES, metrics, phase_of
 from .prepare import FEW, Prepared
-from .problem import nuisance_coordinate
+from .search import Progress, Search, silent
 from .wording import clock_note
 
 Array = NDArray[np.float64]
@@ -136,19 +136,33 @@ class Comparison:
 
 
 def compare(
-    prepared: Prepared, *, fitted: bool = False, values: Mapping[str, float] | None = None, seed: int = 0
+    prepared: Prepared,
+    *,
+    fitted: bool = False,
+    values: Mapping[str, float] | None = None,
+    seed: int = 0,
+    executor: Executor | None = None,
+    progress: Progress = silent,
 ) -> Comparison:
-    """Compare the prepared model as it is, or with its nuisance parameters fitted first.
+    """Compare the prepared model as it is, or with its nuisance parameters fitted first, as a diagnosis fits them.
 
-    values  parameters to use instead (those of a diagnosis, with its model in `prepared`)
+    values    parameters to use instead (those of a diagnosis, with its model in `prepared`)
+    executor  where the fit is done, and where its results are kept; this process if None
     """
     features, model = prepared.features, prepared.model
     own: list[str] = []
     if values is None:
         values = {}
         if fitted:
-            coordinates = [nuisance_coordinate(n) for n in prepared.nuisances]
-            found = fit(prepared.problem, model, coordinates, {}, evaluations=15)
+            search = Search(
+                prepared.problem,
+                model,
+                prepared.nuisances,
+                {},
+                executor=executor or Executor(),
+                progress=progress,
+            )
+            found = search.null().fit
             values, own = found.values, clock_note(prepared.problem, found)
     predicted = features.closures(prepared.rig, model, values)
     contact = _contact(prepared, values)

@@ -37,7 +37,8 @@ class EffectParameter:
 
     unit           SI
     lower, upper   bounds of the search; what physics allows
-    typical        a value that a hand may show; sets the scale of the search
+    typical        a value that a hand may show; sets the scale of the search, and in recordings of another machine than
+                   the simulator's no strength beyond eight times this is believed
     vanishing      the value at which the effect contributes exactly nothing, or None for a shape parameter
     starts         values from which a search starts, where the error has several minima; without them a strength is
                    searched at multiples of its typical value
