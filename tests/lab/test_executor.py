@@ -212,7 +212,7 @@ def ended_in_the_first_round(words: list[str], cache: Path, end: Callable[[int],
     while process.poll() is None and (not kept.exists() or len(list(kept.glob("*.npz"))) < begun):
         time.sleep(0.02)
     end(process.pid)
-    out, err = process.communicate()
+    out, err = process.communicate(timeout=60.0)
     assert out == ""
     return process.returncode, err
 
@@ -225,6 +225,13 @@ def test_sigterm_ends_a_run_as_ctrl_c_does(
     code, err = ended_in_the_first_round(words, tmp_path, lambda process: kill(process, signal.SIGTERM))
     said = "hannes: terminated; what was found is kept: the same command goes on from there"
     assert (code, err.strip().splitlines()) == (143, [said])
+
+
+def test_workers_end_with_a_command_that_is_killed(recordings: Path, tmp_path: Path) -> None:
+    """They hold its output open: what reads it would wait for ever."""
+    words = ["diagnose", str(recordings), "--max-effects", "1", "--json", "--jobs", "2"]
+    code, _ = ended_in_the_first_round(words, tmp_path, lambda process: os.kill(process, signal.SIGKILL))
+    assert code == -signal.SIGKILL
 
 
 def test_ctrl_c_in_the_first_round_and_the_same_command_goes_on(

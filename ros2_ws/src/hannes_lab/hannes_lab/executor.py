@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import copy
 import functools
+import os
 import re
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -34,6 +36,9 @@ Work = Callable[..., Any]
 
 ADDRESS = re.compile(r"((tcp|tls|wss?|ucxx?)://)?[^/\s]+:\d+|inproc://\S+")
 """What a Dask client takes as an address; with others it prints a traceback of its own."""
+
+PARENT_S = 1.0
+"""How often a worker looks whether the process that started it is still there, in seconds."""
 
 CONNECT_S = 10
 """Seconds in which a Dask scheduler must answer, and have a worker."""
@@ -67,7 +72,8 @@ class Executor:
     def run(self, work: Work, shared: Any, key: str, items: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
         """(k, work(shared, key, *items[k])) for every item, as they are done."""
         code = code_hash() if self.dask else None
-        tasks = [delayed(_numbered)(k, code, work, shared, key, item) for k, item in enumerate(items)]
+        parent = None if self.dask else os.getpid()
+        tasks = [delayed(_numbered)(k, code, parent, work, shared, key, item) for k, item in enumerate(items)]
         options = {"backend": "dask", "client": self.client()} if self.dask else {"backend": "loky"}
         with parallel_config(**options):
             parallel = Parallel(
@@ -133,13 +139,40 @@ def _deaf_workers() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _numbered(number: int, code: str | None, work: Work, shared: Any, key: str, item: tuple[Any, ...]) -> Any:
+def _numbered(
+    number: int,
+    code: str | None,
+    parent: int | None,
+    work: Work,
+    shared: Any,
+    key: str,
+    item: tuple[Any, ...],
+) -> Any:
+    if parent is not None:
+        _end_with(parent)
     if code is not None and code != code_hash():
         raise HannesError(
             "A worker has other sources of hannes or other versions of its libraries than this process: install the "
             "same on all machines."
         )
     return number, work(shared, key, *item)
+
+
+@functools.cache
+def _end_with(parent: int) -> None:
+    """Let a worker process end soon after the process that started it, were that killed.
+
+    Else it would go on to wait for work, with its memory and with the output that it inherited held open.
+    """
+    if os.getpid() == parent:
+        return  # joblib works where it is called if it may start no process
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True, name="parent").start()
 
 
 class Held(threading.local):
