@@ -180,6 +180,20 @@ def test_the_encoder_by_name_or_alone(tmp_path: Path) -> None:
         read_bag(path)
 
 
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [(("thumb", "motor_pulley"), "1 for thumb, motor_pulley"), (("motor_pulley",), "2 for motor_pulley")],
+)
+def test_more_or_fewer_numbers_than_joints(tmp_path: Path, names: tuple[str, ...], told: str) -> None:
+    messages = motor_messages(STAMPS, joint=names)
+    other = cdr.encode_joint_states(STAMPS, names, np.zeros((300, 3 - len(names))))
+    messages["/hannes/motor/state"] = (cdr.JOINT_STATE, list(zip(STAMPS.tolist(), other, strict=True)))
+    path = foreign_bag(tmp_path / "a", messages)
+    with pytest.raises(HannesError, match=f"another number of positions than of names .message 0: {told}"):
+        read_bag(path)
+    assert set(read_bag(path, topics={"encoder_position": None}).channels) == {"motor_current"}
+
+
 def joint_bag(path: Path, names: tuple[str, ...], velocity: bool = True) -> Path:
     angles = np.arange(len(names)) * 0.01 + np.zeros((len(STAMPS), 1))
     states = cdr.encode_joint_states(STAMPS, names, angles, angles if velocity else None)

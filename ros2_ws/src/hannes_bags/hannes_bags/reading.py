@@ -154,6 +154,14 @@ def _naming(signal: str, topic: str | None) -> str:
     return f"--topic {signal}={topic or ''} (topics={{{signal!r}: {topic!r}}} in Python)"
 
 
+def _instead(signal: Signal) -> str:
+    """What to do about a topic that cannot be the signal; without the reference nothing is compared."""
+    or_not = (
+        "" if signal.name == "reference_position" else f", or leave it out with {_naming(signal.name, None)}"
+    )
+    return f"Name another topic with {HOW_TO_NAME}{or_not}."
+
+
 class _Reader:
     """Makes the channels of one bag; holds what the steps share."""
 
@@ -257,11 +265,9 @@ class _Reader:
         if signal.name == "reference_position":
             usable.add(cdr.JOINT_STATE)
         if found not in usable:
-            needed = signal.name == "reference_position"
-            or_not = "" if needed else f", or leave it out with {_naming(signal.name, None)}"
             raise HannesError(
                 f"The bag {self.path}: topic {topic} is a {found}, but {signal.name} is a {signal.type}. "
-                f"Name another topic with {HOW_TO_NAME}{or_not}."
+                f"{_instead(signal)}"
             )
 
     def _is(self, topic: str) -> bool:
@@ -346,6 +352,7 @@ class _Reader:
         for signal in signals:
             part = "position" if signal.field == "data" else signal.field
             fields = [(block, column, getattr(block, part)) for block, column in usable]
+            self._check_numbers(topic, signal, part, fields)
             missing = [
                 field.shape[1] == 0 or bool(np.isnan(field[:, column]).all()) for _, column, field in fields
             ]
@@ -356,10 +363,6 @@ class _Reader:
                         f"The messages on {topic} have no {part}: there is no {signal.name}."
                     )
                 continue
-            if any(field.shape[1] not in (0, len(block.names) or 1) for block, _, field in fields):
-                raise HannesError(
-                    f"The bag {self.path}: {topic} has another number of {part}s than of names."
-                )
             present = [entry for entry in fields if entry[2].shape[1]]
             indices = np.concatenate([block.indices for block, _, _ in present])
             values = np.concatenate([field[:, column] for _, column, field in present])
@@ -371,6 +374,22 @@ class _Reader:
                 if signal.name in samples:
                     stamps, values = samples[signal.name]
                     samples[signal.name] = (stamps, values[:, 0])
+
+    def _check_numbers(
+        self,
+        topic: str,
+        signal: Signal,
+        part: str,
+        fields: list[tuple[cdr.JointStates, list[int], npt.NDArray[np.float64]]],
+    ) -> None:
+        """Refuse a field with more or fewer numbers than there are joints: which is whose cannot be told."""
+        for block, _, values in fields:
+            if values.shape[1] not in (0, len(block.names) or 1):
+                raise HannesError(
+                    f"The bag {self.path}: {topic} has another number of {part}s than of names (message "
+                    f"{int(block.indices[0])}: {values.shape[1]} for {', '.join(block.names) or 'no name'}). "
+                    f"{_instead(signal)}"
+                )
 
     def _drop_repeats(
         self, topic: str, names: list[str], samples: dict[str, tuple[IntArray, npt.NDArray[Any]]]
