@@ -14,6 +14,7 @@ from hannes_bags.cli import info
 from hannes_bags.reading import bag_info, read_bag
 from hannes_bags.recover import recover
 from hannes_bags.writing import BagWriter, write_recording
+from hannes_bringup.cli.bags import recover as recover_command
 from hannes_description.errors import HannesError
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -36,6 +37,7 @@ def test_without_metadata_yaml_everything_is_kept(tmp_path: Path) -> None:
     assert back.differences(whole) == []
     assert back.metadata["condition"] == "slow" and back.metadata["recovered_from"] == "bag"
     assert (saved.damage, saved.unread_bytes, saved.lost_s) == ((), 0, 0.0)
+    assert saved.losses == "no message is missing"
     assert saved.messages == whole.metadata["bag"]["messages"]
     with AnyReader([tmp_path / "saved"]) as reader:
         assert reader.message_count == saved.messages
@@ -53,6 +55,7 @@ def test_a_cut_file_keeps_all_up_to_the_cut(tmp_path: Path, part: float) -> None
     saved = recover(bag, tmp_path / "saved")
     assert {path.name: path.read_bytes() for path in bag.iterdir()} == before
     assert len(saved.damage) == 1 and "cut" in saved.damage[0]
+    assert saved.recorded is None and saved.losses.startswith("how much is missing is not known")
     back = read_bag(tmp_path / "saved")
     for name, channel in back.channels.items():
         n = channel.time.size
@@ -71,7 +74,9 @@ def test_a_hole_in_the_middle_costs_its_chunk_only(tmp_path: Path) -> None:
     saved = recover(file, tmp_path / "saved")
     total = bag_info(long_bag(tmp_path / "twin")).message_count
     assert total - 700 < saved.messages < total
-    assert any("checksum" in sentence for sentence in saved.damage)
+    assert any("checksum" in sentence for sentence in saved.damage) and saved.recorded is None
+    told = recover(file.parent, tmp_path / "told")
+    assert (told.recorded, told.lost_s) == (total, 0.0)
     del data[place : place + 13]
     file.write_bytes(data)
     assert recover(file, tmp_path / "again").messages == saved.messages
@@ -189,6 +194,26 @@ def test_sqlite_with_damage_keeps_both_ends(tmp_path: Path) -> None:
         assert "no message to save" in str(error)
 
 
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_what_is_missing_against_metadata_yaml(tmp_path: Path, storage: StoragePlugin) -> None:
+    path = foreign_bag(tmp_path / "bag", motor_messages(STAMPS), storage)
+    file = next(child for child in path.iterdir() if child.suffix != ".yaml")
+    if storage == StoragePlugin.MCAP:
+        file.write_bytes(file.read_bytes()[:100_000])
+    else:
+        with sqlite3.connect(file) as connection:
+            connection.execute("DELETE FROM messages WHERE timestamp > 1000000000")
+        connection.close()
+    saved = recover(path, tmp_path / "saved")
+    assert saved.recorded == 4000 and saved.lost_s == pytest.approx(2.0 - saved.end_ns * 1e-9, abs=2e-6)
+    assert saved.losses.startswith(
+        f"{4000 - saved.messages} of 4000 messages are missing, about {saved.lost_s:.3f}"
+    )
+    stale = path / "metadata.yaml"
+    stale.write_text(stale.read_text().replace("4000", "7"))
+    assert recover(path, tmp_path / "again").recorded == (None if saved.damage else saved.messages)
+
+
 # ---- commands -----------------------------------------------------------------------------------------------------
 
 
@@ -202,4 +227,8 @@ def test_the_command_that_tells_what_is_in_a_bag(tmp_path: Path) -> None:
     assert content["sha256"] == read_bag(bag).sha256 and content["metadata"]["condition"] == "slow"
     (bag / "metadata.yaml").unlink()
     assert recover(bag, tmp_path / "saved").as_dict()["messages"] == content["message_count"]
+    saving = typer.Typer()
+    saving.command()(recover_command)
+    told = CliRunner().invoke(saving, [str(bag), str(tmp_path / "said")])
+    assert told.exit_code == 0 and "no message is missing" in told.output
     assert isinstance(CliRunner().invoke(app, [str(bag)]).exception, HannesError)

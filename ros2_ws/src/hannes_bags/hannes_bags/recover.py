@@ -48,8 +48,11 @@ class Recovery:
     start_ns, end_ns first and last log time kept
     input_bytes      size of the input's storage files
     unread_bytes     bytes behind the last message that could be read
-    lost_s           estimate of the lost tail, s: unread bytes at the mean rate of the rest (what the
-                     recorder had not handed over yet, at most 0.2 s, comes on top)
+    recorded         number of messages that were there, by metadata.yaml or the files themselves; None if a cut
+                     or damaged file is all that is known
+    lost_s           the lost tail, s: up to the end that metadata.yaml tells of; else an estimate, unread bytes at
+                     the mean rate of the rest (what the recorder had not handed over yet, at most 0.2 s, comes on
+                     top, and what lay behind a cut is not known)
     damage           what was wrong, as sentences; empty if only metadata.yaml was missing
     """
 
@@ -61,6 +64,7 @@ class Recovery:
     end_ns: int
     input_bytes: int
     unread_bytes: int
+    recorded: int | None
     lost_s: float
     damage: tuple[str, ...]
 
@@ -68,6 +72,19 @@ class Recovery:
     def duration(self) -> float:
         """Time span kept, s."""
         return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def losses(self) -> str:
+        """What is missing, as a sentence."""
+        if self.recorded is None:
+            return (
+                f"how much is missing is not known; of what is there, {self.unread_bytes} bytes at the end, "
+                f"about {self.lost_s:.3f} s, could not be read"
+            )
+        if self.recorded == self.messages:
+            return "no message is missing"
+        missing = self.recorded - self.messages
+        return f"{missing} of {self.recorded} messages are missing, about {self.lost_s:.3f} s at the end"
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-like."""
@@ -91,6 +108,11 @@ class _Salvage:
     metadata: dict[str, Any] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     unread_bytes: int = 0
+    recorded: int | None = 0
+
+    def was_there(self, count: int | None) -> None:
+        """Add a file's number of messages; None if it cannot be known."""
+        self.recorded = None if count is None or self.recorded is None else self.recorded + count
 
     def leave_out(self, sentence: str) -> None:
         """Note once what was left out many times."""
@@ -114,9 +136,11 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
     if out.exists():
         raise HannesError(f"{out} exists already; a bag is never overwritten. Choose another name.")
     salvage = _Salvage()
+    information: Mapping[str, Any] = {}
     if path.is_dir() and (path / METADATA_FILE).exists():
         try:
-            salvage.metadata.update(decode_entries(load_metadata(path / METADATA_FILE).get("custom_data")))
+            information = load_metadata(path / METADATA_FILE)
+            salvage.metadata.update(decode_entries(information.get("custom_data")))
         except HannesError as error:
             salvage.damage.append(str(error).split(" Run `")[0])
     _gather_metadata(files, salvage)
@@ -143,19 +167,45 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
         raise HannesError(f"There is no message to save in {path}. {reason}")
     _verify(out, counts)
     size = sum(file.stat().st_size for file in files)
-    kept = max(1, size - salvage.unread_bytes)
+    messages = sum(counts.values())
+    recorded, end = _told(information, messages)
+    if recorded is None:
+        recorded = salvage.recorded
+    if end is None:
+        kept = max(1, size - salvage.unread_bytes)
+        end = last + round(salvage.unread_bytes / kept * (last - first))
     return Recovery(
         source=str(path),
         output=str(out),
-        messages=sum(counts.values()),
+        messages=messages,
         topics=counts,
         start_ns=first,
         end_ns=last,
         input_bytes=size,
         unread_bytes=salvage.unread_bytes,
-        lost_s=salvage.unread_bytes / kept * (last - first) * 1e-9,
+        recorded=recorded,
+        lost_s=max(0, end - last) * 1e-9,
         damage=tuple(salvage.damage),
     )
+
+
+def _told(information: Mapping[str, Any], kept: int) -> tuple[int | None, int | None]:
+    """Number of messages and time of the last one [ns] by metadata.yaml; None where it does not tell.
+
+    One that tells of fewer messages than were found is older than the files.
+    """
+    count = _whole_number(information.get("message_count"))
+    if count is None or count < kept:
+        return None, None
+    times = [
+        _whole_number(entry.get(unit)) if isinstance(entry := information.get(key), Mapping) else None
+        for key, unit in (("starting_time", "nanoseconds_since_epoch"), ("duration", "nanoseconds"))
+    ]
+    return count, None if None in times else sum(filter(None, times))
+
+
+def _whole_number(value: object) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63 else None
 
 
 def _storage_files(path: Path) -> list[Path]:
@@ -235,6 +285,7 @@ def _buffers(file: Path) -> Iterator[memoryview]:
 def _mcap_messages(file: Path, salvage: _Salvage) -> Iterator[tuple[str, int, bytes | memoryview]]:
     if file.stat().st_size == 0:
         salvage.damage.append(f"{file.name} is empty.")
+        salvage.was_there(None)
     for buffer in _buffers(file):
         scan = McapScan(buffer, _NO_LIMIT, tolerant=True)
         topics: dict[int, str] = {}
@@ -254,6 +305,7 @@ def _mcap_messages(file: Path, salvage: _Salvage) -> Iterator[tuple[str, int, by
         except McapDamage as damage:
             scan.damage.append(damage)
         salvage.damage.extend(f"{file.name}: {damage}." for damage in scan.damage[:20])
+        salvage.was_there(scan.message_count if scan.complete and not scan.damage else None)
         if not scan.complete:
             salvage.unread_bytes += len(buffer) - scan.salvaged_bytes
 
@@ -268,6 +320,7 @@ def _unique(topic: str, definition: _Definition, salvage: _Salvage) -> str:
 
 
 def _sqlite_messages(file: Path, salvage: _Salvage) -> Iterator[tuple[str, int, bytes]]:
+    before = len(salvage.damage)
     with TemporaryDirectory() as folder:
         copy = Path(folder) / "copy.db3"
         shutil.copyfile(file, copy)
@@ -284,11 +337,13 @@ def _sqlite_messages(file: Path, salvage: _Salvage) -> Iterator[tuple[str, int, 
                 for name, definition in list(salvage.definitions.items()):
                     salvage.definitions[name] = _with_text(connection, definition)
                 rows = _rows_around_damage(connection, file.name, salvage)
+                salvage.was_there(len(rows) if len(salvage.damage) == before else None)
                 for _, identity, log_ns, data in rows:
                     if identity in topics and isinstance(log_ns, int) and isinstance(data, bytes):
                         yield topics[identity], log_ns, data
         except (sqlite3.Error, sqlite3.Warning, OverflowError, UnicodeDecodeError) as error:
             salvage.damage.append(f"{file.name}: {one_line(error)}.")
+            salvage.was_there(None)
 
 
 def _with_text(connection: sqlite3.Connection, definition: _Definition) -> _Definition:

@@ -126,7 +126,7 @@ def recover(
         print_json(saved.as_dict())
         return
     typer.echo(f"{saved.output}: {saved.messages} messages, {saved.duration:.3f} s saved from {saved.source}")
-    typer.echo(f"about {saved.lost_s:.3f} s lost at the end ({saved.unread_bytes} bytes could not be read)")
+    typer.echo(saved.losses)
     for line in saved.damage:
         typer.echo(f"damage: {line}")
 
