@@ -56,6 +56,11 @@ def all_nan(signals: Signals) -> Signals:
     return signals
 
 
+def dead(signals: Signals) -> Signals:
+    signals["motor_current"][1][:] = 0.0
+    return signals
+
+
 def doubled(signals: Signals) -> Signals:
     t, v = signals["motor_current"]
     again = np.sort(np.concatenate([np.arange(t.size), np.arange(100, 107)]))
@@ -99,6 +104,10 @@ def shifted(signals: Signals) -> Signals:
         (without("encoder_position"), "no encoder position is recorded"),
         (holes_of_nan, "2 of 615 samples of motor_current are not finite"),
         (all_nan, "no current is recorded"),
+        (
+            dead,
+            "motor_current is 0 A throughout, though the reference moves: it was not measured and is left out",
+        ),
         (scaled(encoder_position=180.0 / math.pi), "looks like degrees"),
         (
             scaled(encoder_position=1.0 / RAD_PER_COUNT, reference_position=1.0 / RAD_PER_COUNT),

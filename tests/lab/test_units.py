@@ -121,6 +121,21 @@ def test_a_current_in_neither_A_nor_mA_is_said(factor: float, said: str) -> None
     assert values(taken, "motor_current") == pytest.approx(values(closing(), "motor_current"))
 
 
+def test_a_current_that_never_changes_was_not_measured() -> None:
+    dead = changed(closing(), motor_current=0.0)
+    trial = make_trial(dead)
+    assert "motor_current" not in trial.signals and "it was not measured and is left out" in trial.notes[-1]
+    taken = make_trial(dead, scale={"motor_current": 1.0})
+    assert not values(taken, "motor_current").any()
+    there, gone = in_si([closing(), dead], {})
+    assert "motor_current" in there and not there.warnings and "motor_current" not in gone
+    alone = Recording({n: c for n, c in dead.channels.items() if n != "encoder_position"}, {}, "alone")
+    with pytest.raises(
+        HannesError, match=r"alone: motor_current is 0 A throughout.*nothing else can be compared"
+    ):
+        make_trial(alone)
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [

@@ -1,4 +1,4 @@
-"""Signals in another unit than SI, with the other sign, shifted or with absurd samples: noticed, mended, and said.
+"""Signals in another unit than SI, with another sign, shifted, dead or with absurd samples: noticed, mended, and said.
 
 The recordings of one command come from one recorder: unit, sign and shift of a signal are decided once, from all of
 them, and are the same in all.  Encoder and reference go over at most a few turns of the pulley (a full closure is
@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 Guess = tuple[float, str, float]
 
 REFERENCE, ENCODER, CURRENT = "reference_position", "encoder_position", "motor_current"
+
+DRIVES = (CURRENT, "motor_voltage", "motor_effort")
+"""What a motor takes: it changes where the reference moves, whatever the hand does.  A grip force need not."""
 
 _ANGLE_UNITS: tuple[Guess, ...] = (
     (1000.0, "encoder counts", RAD_PER_COUNT),
@@ -109,7 +112,7 @@ class _One:
 
 
 def in_si(recordings: Sequence[Recording], scale: Mapping[str, float]) -> list[Recording]:
-    """The recordings of one recorder in SI, each with what was done among its warnings.
+    """The recordings of one recorder in SI, each with what was done among its warnings; without signals that are dead.
 
     scale   factors by signal name that the user gives
     Raises HannesError for an encoder that does not follow the reference (another unit, shaft or sign), a current that
@@ -121,6 +124,7 @@ def in_si(recordings: Sequence[Recording], scale: Mapping[str, float]) -> list[R
     ]
     for one in ones:
         _drop_absurd(one)
+        _drop_dead(one, scale)
     for name in dict.fromkeys(name for one in ones for name in one.samples):
         with_it = [one for one in ones if name in one.samples]
         if name in scale:
@@ -143,6 +147,7 @@ def _recording(recording: Recording, one: _One) -> Recording:
     channels = {
         name: replace(channel, time=one.samples[name][0], values=one.samples[name][1])
         for name, channel in recording.channels.items()
+        if name in one.samples
     }
     # The reader's guesses at units give way to what was done.
     read = [w for w in recording.warnings if "which looks like" not in w]
@@ -165,6 +170,26 @@ def _drop_absurd(one: _One) -> None:
                 f"{int(absurd.sum())} of {values.size} samples of {name} are far outside everything else that it does "
                 f"(one is {farthest:.4g}); they were left out"
             )
+
+
+def _drop_dead(one: _One, scale: Mapping[str, float]) -> None:
+    """Leave out what a motor takes where it never changes though the reference moves: nothing was measured."""
+    for name in DRIVES:
+        if name not in one.samples or name in scale or one.asked == 0.0:
+            continue
+        values = one.samples[name][1]
+        if values.size < FEW or np.ptp(values) > 0.0:
+            continue
+        told = f"{name} is {values[0]:.4g} {SIGNALS[name].unit} throughout, though the reference moves"
+        if set(one.samples) == {REFERENCE, name}:
+            raise HannesError(
+                f"{one.where}: {told}: it was not measured, and nothing else can be compared. Record it again, with an "
+                f"encoder, or say --scale {name}=1 to take it as it is."
+            )
+        del one.samples[name]
+        one.notes.append(
+            f"{told}: it was not measured and is left out; say --scale {name}=1 to take it as it is"
+        )
 
 
 def _absurd(values: Array, far: float) -> NDArray[np.bool_]:
