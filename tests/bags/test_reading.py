@@ -221,6 +221,29 @@ def test_messages_of_other_joints_on_the_same_topic_are_left_out(tmp_path: Path)
     assert any("300 messages on /joint_states are of other joints" in text for text in back.warnings)
 
 
+def test_messages_without_any_joint_are_said_to_be_empty(tmp_path: Path) -> None:
+    messages = motor_messages(STAMPS)
+    kind, entries = messages["/hannes/motor/state"]
+    nothing = cdr.encode_joint_states(STAMPS, (), np.zeros((300, 0)))
+    messages["/hannes/motor/state"] = (
+        kind,
+        [*entries[:200], *zip(STAMPS[200:].tolist(), nothing, strict=False)],
+    )
+    back = read_quietly(foreign_bag(tmp_path / "a", messages))
+    assert back["encoder_position"].time.size == 200
+    assert back.warnings == ("100 messages on /hannes/motor/state have no joint at all; they were left out.",)
+
+
+def test_positions_that_are_all_nan_are_not_said_to_be_missing(tmp_path: Path) -> None:
+    for k, (values, told) in enumerate(((np.nan, "have NaN for every position"), (None, "have no position"))):
+        angles = np.zeros((300, 0)) if values is None else np.full((300, 1), values)
+        states = cdr.encode_joint_states(STAMPS, ("motor_pulley",), angles)
+        messages = motor_messages(STAMPS)
+        messages["/hannes/motor/state"] = (cdr.JOINT_STATE, list(zip(STAMPS.tolist(), states, strict=True)))
+        back = read_quietly(foreign_bag(tmp_path / str(k), messages))
+        assert told in back.warnings[0] and set(back.channels) == {"motor_current"}
+
+
 def test_samples_that_are_not_finite_are_left_out_and_told(tmp_path: Path) -> None:
     messages = motor_messages(STAMPS)
     entries = messages["/hannes/motor/current"][1]
@@ -285,6 +308,18 @@ def test_unstamped_joint_states_take_the_log_time(tmp_path: Path) -> None:
     back = read_quietly(foreign_bag(tmp_path / "a", motor_messages(0 * STAMPS, STAMPS + WALL)))
     assert "carry no stamp" in back.warnings[0] and back.metadata["clock"]["kind"] == "log"
     assert np.array_equal(back["encoder_position"].time, (STAMPS - 1_000_000) / 1e9)
+
+
+def test_some_messages_without_a_stamp(tmp_path: Path) -> None:
+    """On a clock that is set no stamp is zero; simulated time may begin with one, and does not come back to it."""
+    for k, (zero, start, told) in enumerate(((50, WALL, 1), (0, WALL, 1), (50, 0, 1), (0, 0, 0))):
+        stamps = STAMPS + start
+        stamps[zero] = 0
+        back = read_quietly(foreign_bag(tmp_path / str(k), motor_messages(stamps, STAMPS + WALL)))
+        said = "1 of 300 messages on /hannes/motor/state carry no stamp (it is zero)"
+        assert sum(said in text for text in back.warnings) == told
+        if told:
+            assert np.array_equal(back["encoder_position"].time, (STAMPS - 1_000_000) / 1e9)
 
 
 def test_two_stamped_topics_on_two_clocks(tmp_path: Path) -> None:

@@ -47,6 +47,8 @@ _PLAUSIBLE: Mapping[str, tuple[float, str]] = {
 }
 """Greatest range (for positions) or magnitude that SI units let expect, and what a greater one may be."""
 _DEGREES = 60.0
+_THIS_CENTURY_NS = 946_684_800 * 10**9
+"""Stamps (ns since 1970) from here on are of a clock that is set; on it nothing happens at zero."""
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,18 @@ def _instead(signal: Signal) -> str:
         "" if signal.name == "reference_position" else f", or leave it out with {_naming(signal.name, None)}"
     )
     return f"Name another topic with {HOW_TO_NAME}{or_not}."
+
+
+def _is_empty(block: cdr.JointStates) -> bool:
+    return not block.names and not block.position.shape[1]
+
+
+def _unstamped(stamps: IntArray) -> int:
+    """Number of zero stamps (n,) that are no times: simulated time may begin with some, but never comes back."""
+    zero = stamps == 0
+    if int(stamps.max()) < _THIS_CENTURY_NS:
+        zero = zero & np.maximum.accumulate(~zero)
+    return int(zero.sum()) if not zero.all() else 0
 
 
 class _Reader:
@@ -301,6 +315,12 @@ class _Reader:
         if not stamps.any() and len(stamps) > 1:
             self.warnings.append(f"The messages on {topic} carry no stamp: the recorder's times were used.")
             return None
+        if unstamped := _unstamped(stamps):
+            self.warnings.append(
+                f"{unstamped} of {len(stamps)} messages on {topic} carry no stamp (it is zero): the recorder's times "
+                "were used for all of them."
+            )
+            return None
         return stamps, self._log_ns(topic)
 
     def _relation(self, states: dict[str, list[cdr.JointStates]]) -> ClockRelation:
@@ -344,11 +364,11 @@ class _Reader:
         if not usable:
             self._no_joints(topic, blocks, scalar)
             return
-        skipped = sum(
-            len(block.indices) for block, column in zip(blocks, columns, strict=True) if column is None
-        )
-        if skipped:
-            self.warnings.append(f"{skipped} messages on {topic} are of other joints; they were left out.")
+        skipped = [block for block, column in zip(blocks, columns, strict=True) if column is None]
+        for empty, what in ((True, "have no joint at all"), (False, "are of other joints")):
+            count = sum(len(block.indices) for block in skipped if _is_empty(block) == empty)
+            if count:
+                self.warnings.append(f"{count} messages on {topic} {what}; they were left out.")
         for signal in signals:
             part = "position" if signal.field == "data" else signal.field
             fields = [(block, column, getattr(block, part)) for block, column in usable]
@@ -358,7 +378,11 @@ class _Reader:
             ]
             if all(missing):
                 # velocity and effort are optional in a JointState: to leave them out is no fault
-                if part == "position" or any(field.shape[1] for _, _, field in fields):
+                if any(field.shape[1] for _, _, field in fields):
+                    self.warnings.append(
+                        f"The messages on {topic} have NaN for every {part}: there is no {signal.name}."
+                    )
+                elif part == "position":
                     self.warnings.append(
                         f"The messages on {topic} have no {part}: there is no {signal.name}."
                     )
@@ -427,7 +451,7 @@ class _Reader:
         return None
 
     def _no_joints(self, topic: str, blocks: list[cdr.JointStates], scalar: bool) -> None:
-        names = blocks[0].names
+        names = next((block.names for block in blocks if not _is_empty(block)), ())
         if scalar:
             raise HannesError(
                 f"The bag {self.path}: {topic} has the joints {', '.join(names) or '(none)'}, but not "
