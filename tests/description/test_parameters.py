@@ -48,6 +48,10 @@ def test_the_hash_tells_simulations_apart_not_names() -> None:
         ("schema: hannes/model/1\nparameters: nobody\n", "shipped are"),
         ("schema: hannes/model/1\neffects: [{name: x}]\n", "every effect needs"),
         ("schema: [\n", "not valid YAML"),
+        (
+            "schema: a\n\tb: c\n",
+            r"not valid YAML: line 2, column 1: while scanning .* cannot start any token",
+        ),
         ("- 1\n", "must be a mapping"),
         ("schema: !!python/object/apply:os.system [ls]\n", "not valid YAML"),
         ("a: " + "[" * 20000, "not valid YAML"),

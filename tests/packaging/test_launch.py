@@ -130,7 +130,7 @@ def test_what_it_does_not_understand_is_refused(tmp_path: Path, action: object, 
 def test_broken_yaml_is_one_error(tmp_path: Path) -> None:
     path = tmp_path / "x.launch.yaml"
     path.write_text("launch: [")
-    with pytest.raises(HannesError, match="not valid YAML"):
+    with pytest.raises(HannesError, match="not valid YAML: line 1, column 10: "):
         read_launch_file(path, {}, share)
 
 

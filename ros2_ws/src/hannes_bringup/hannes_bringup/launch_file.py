@@ -18,6 +18,7 @@ from typing import Any
 
 import yaml
 from hannes_description.errors import HannesError
+from hannes_description.parameters import yaml_fault
 
 ACTION_KEYS = {
     "arg": ("name", "default", "description", "choice"),
@@ -101,7 +102,7 @@ def _actions(path: Path) -> list[tuple[str, dict[str, Any]]]:
     except (OSError, UnicodeDecodeError) as error:
         raise HannesError(f"Cannot read launch file '{path}': {error}.") from error
     except yaml.YAMLError as error:
-        raise HannesError(f"Launch file '{path}' is not valid YAML: {str(error).splitlines()[0]}.") from error
+        raise HannesError(f"Launch file '{path}' is not valid YAML: {yaml_fault(error)}.") from error
     if not isinstance(content, dict) or set(content) != {"launch"} or not isinstance(content["launch"], list):
         raise HannesError(f"{path}: a launch file is a mapping with the one key 'launch', a list of actions.")
     actions = []

@@ -201,7 +201,16 @@ def read_yaml(path: Path, what: str) -> Any:
     try:
         return yaml.load(text, Loader=yaml.CSafeLoader) if ours else yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise HannesError(f"{what} '{path}' is not valid YAML: {str(error).splitlines()[0]}.") from error
+        raise HannesError(f"{what} '{path}' is not valid YAML: {yaml_fault(error)}.") from error
+
+
+def yaml_fault(error: Exception) -> str:
+    """What is wrong with a YAML text, in one line, and where."""
+    mark = getattr(error, "problem_mark", None)
+    if mark is None:
+        return str(error).splitlines()[0]
+    context, problem = (getattr(error, name, None) for name in ("context", "problem"))
+    return f"line {mark.line + 1}, column {mark.column + 1}: {', '.join(filter(None, (context, problem)))}"
 
 
 def data_path(*parts: str) -> Path:
