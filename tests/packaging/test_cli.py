@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -65,6 +66,13 @@ def test_every_subcommand_has_help(command: Command) -> None:
 def test_one_subcommand_for_real() -> None:
     answer = hannes("model", "show", "--help")
     assert answer.returncode == 0 and "--json" in answer.stdout
+
+
+@pytest.mark.parametrize("words", [("model", "show"), ("model", "show", "--json"), ("--version",)])
+def test_a_closed_output_is_one_line(words: tuple[str, ...]) -> None:
+    answer = hannes(*words, preexec_fn=lambda: os.close(1))
+    assert (answer.returncode, answer.stdout) == (1, "")
+    assert answer.stderr == "hannes: the output cannot be written: Bad file descriptor.\n"
 
 
 def test_version() -> None:

@@ -126,6 +126,7 @@ def load(command: Command) -> Any:
 def main() -> int:
     """Entry point of `hannes`."""
     code: int | str | None = 0
+    _open_what_is_closed()
     try:
         build_app()()
     except HannesError as error:
@@ -151,6 +152,14 @@ def main() -> int:
     if code is None or isinstance(code, int):
         return code or 0
     raise SystemExit(code)
+
+
+def _open_what_is_closed() -> None:
+    """An output that was closed (`hannes ... >&-`) is none at all; one that takes nothing fails as a full disk does."""
+    if sys.stdout is None:
+        sys.stdout = os.fdopen(os.open(os.devnull, os.O_RDONLY), "w")
+    if sys.stderr is None:
+        sys.stderr = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
 
 
 def _nobody_reads() -> int:
