@@ -89,6 +89,11 @@ def shifted(signals: Signals) -> Signals:
     return {**signals, "encoder_position": (t, v + 100.0)}
 
 
+def an_hour_later(signals: Signals) -> Signals:
+    t, v = signals["motor_current"]
+    return {**signals, "motor_current": (t + 3600.0, v)}
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -152,6 +157,7 @@ def test_it_works_through_and_says_so(
         (scaled(encoder_position=19.0), "at another shaft"),
         (scaled(encoder_position=-1.0), "--scale encoder_position=-1"),
         (cut(1.7, 17.0), "no closure was found"),
+        (an_hour_later, "s: they do not overlap in time. Record them together"),
     ],
 )
 def test_what_cannot_be_used_is_one_clear_error(

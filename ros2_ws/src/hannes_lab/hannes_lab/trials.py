@@ -511,6 +511,7 @@ def trial_of(recording: Recording, *, name: str | None = None, period: float = 1
     meta = recording.metadata
     name = name or str(meta.get("condition") or stem_of(recording.source))
     channel = recording["reference_position"]
+    _check_overlap(recording)
     origin = float(channel.time[0])
     origin = math.floor(origin / period + 1e-6) * period
     duration = recording.end - origin
@@ -556,6 +557,18 @@ def trial_of(recording: Recording, *, name: str | None = None, period: float = 1
         recording.sha256,
         tuple(notes),
     )
+
+
+def _check_overlap(recording: Recording) -> None:
+    """Refuse a signal that was recorded at another time than the reference: nothing of it can be compared."""
+    reference = recording["reference_position"].time
+    for name, channel in recording.channels.items():
+        if channel.time[0] > reference[-1] or channel.time[-1] < reference[0]:
+            raise NoClosure(
+                f"{recording.source}: {name} was recorded from {channel.time[0]:.1f} to {channel.time[-1]:.1f} s, but "
+                f"reference_position from {reference[0]:.1f} to {reference[-1]:.1f} s: they do not overlap in time. "
+                f"Record them together and by one clock, or leave the signal out with --topic {name}=."
+            )
 
 
 def in_words(count: int) -> str:
