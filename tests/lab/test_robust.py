@@ -45,6 +45,10 @@ def hole(signals: Signals) -> Signals:
     return {**signals, "encoder_position": (t[keep], v[keep])}
 
 
+def silence(signals: Signals) -> Signals:
+    return {n: (t[(t < 6.0) | (t > 7.0)], v[(t < 6.0) | (t > 7.0)]) for n, (t, v) in signals.items()}
+
+
 def holes_of_nan(signals: Signals) -> Signals:
     signals["motor_current"][1][40:42] = np.nan
     signals["encoder_position"][1][10] = np.inf
@@ -100,6 +104,7 @@ def an_hour_later(signals: Signals) -> Signals:
         (cut(1.7, 2.2), "2 of 5 closures are cut off"),
         (cut(0.0, 10.0, "motor_current"), "closures are cut off"),
         (hole, "1 closure in which samples are missing is left out"),
+        (silence, "nothing was recorded from 6.00 to 7.00 s: what was there is not known"),
         (
             doubled,
             "Messages that repeat the one before, its stamp too, were left out: 7 on /hannes/motor/current",

@@ -182,6 +182,61 @@ def test_a_cut_off_closure_is_left_out_and_said() -> None:
     assert any("cut off" in note for note in trial.notes)
 
 
+SIGNALS = ("reference_position", "encoder_position", "motor_current")
+
+
+def without_samples(whole: Recording, begin: float, end: float, *names: str) -> Recording:
+    kept = {}
+    for name in names:
+        channel = whole[name]
+        keep = (channel.time <= begin) | (channel.time >= end)
+        kept[name] = replace(channel, time=channel.time[keep], values=channel.values[keep])
+    return replace(whole, channels={**whole.channels, **kept})
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "names", "left", "said"),
+    [
+        (5.0, 13.5, SIGNALS, 3, ["nothing was recorded from 5.00 to 13.50 s", "1 closure in which samples"]),
+        (3.9, 4.6, SIGNALS, 5, ["nothing was recorded from 3.90 to 4.60 s", "1 closure in which samples"]),
+        (5.0, 13.5, SIGNALS[1:], 3, ["3 closures in which samples are missing are left out"]),
+        (
+            7.9,
+            16.1,
+            SIGNALS[:1],
+            4,
+            ["reference_position has no sample from 7.90 to 16.10 s: it is guessed there"],
+        ),
+        (8.02, 8.04, SIGNALS, 6, []),
+    ],
+)
+def test_gaps_are_said(begin: float, end: float, names: tuple[str, ...], left: int, said: list[str]) -> None:
+    """Also those in which a closure begins or ends, and closures of which nothing is left."""
+    whole = recording(half_sine(6), 250.0)
+    trial = make_trial(without_samples(whole, begin, end, *names))
+    assert len(trial.closures) == left and len(trial.conditions) == 1
+    assert len(trial.notes) == len(said)
+    assert all(note.startswith(text) for note, text in zip(trial.notes, said, strict=True)), trial.notes
+
+
+def test_a_closure_unlike_the_others_in_which_samples_are_missing_is_said_to_be_that() -> None:
+    pushed = recording(half_sine(6), 250.0, wobble=2)
+    started = "1 closure(s) far from the others are left out, starting at 8.0 s"
+    assert without_outliers(make_trial(pushed)).notes == (started,)
+    short = make_trial(without_samples(pushed, 8.5, 8.61, "encoder_position"))
+    assert without_outliers(short).notes == (started + " (samples of encoder_position are missing in it)",)
+
+
+def test_gaps_in_every_closure_are_the_error() -> None:
+    spoilt = recording(half_sine(3), 250.0)
+    for k in range(3):
+        spoilt = without_samples(spoilt, 4.0 * k + 1.0, 4.0 * k + 1.5 + 0.2 * k, "motor_current")
+    with pytest.raises(
+        HannesError, match=r"samples are missing in each of its closures; 'motor_current' has none for"
+    ):
+        make_trial(spoilt)
+
+
 @pytest.mark.parametrize("rate", [30.0, 50.0])
 def test_a_slow_log_of_the_reference_is_filled_smoothly(rate: float) -> None:
     truth = half_sine(2, amplitude=14.0)

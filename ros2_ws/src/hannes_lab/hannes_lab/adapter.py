@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from .features import Features, kind_of, stands_for_all
 from .rig import REFERENCE_SIZES, PlantRig, Rig
-from .trials import EARLY, Closure, NoClosure, OfAll, Part, Trial, has_gap, left_out, unique_names
+from .trials import EARLY, Closure, NoClosure, OfAll, Part, Trial, has_gap, left_out, unique_names, widest_gap
 from .units import AGAINST, ENCODER, FOLLOWS, STANDS, follows
 
 Array = NDArray[np.float64]
@@ -294,19 +294,11 @@ def _noticed(trial: Trial, where: str) -> Trial:
                 f"{where}: '{name}' was recorded from {time[0]:.6g} to {time[-1]:.6g} s and covers no whole closure."
             )
         if not count:
-            raise NoClosure(f"{where}: samples are missing in each of its closures{_widest_gap(times)}.")
+            raise NoClosure(f"{where}: samples are missing in each of its closures{widest_gap(times)}.")
         if count < len(whole):
             notes.append(f"{name} covers {count} of {len(whole)} closures")
     told = tuple(note for note in notes if note not in trial.notes)
     return replace(trial, closures=whole, notes=(*trial.notes, *told))
-
-
-def _widest_gap(times: Mapping[str, Array]) -> str:
-    name, k, seconds = max(
-        ((n, int(np.argmax(np.diff(t))), float(np.diff(t).max())) for n, t in times.items()),
-        key=lambda gap: gap[2],
-    )
-    return f"; '{name}' has none for {seconds:.3g} s after {times[name][k]:.6g} s"
 
 
 def other_units(rig: Rig, model: Model, features: Features) -> list[str]:

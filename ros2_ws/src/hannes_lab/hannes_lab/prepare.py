@@ -35,6 +35,7 @@ from .trials import (
     Trial,
     compared,
     curves_of,
+    misses_samples,
     stem_of,
     trial_of,
     unique_names,
@@ -179,9 +180,15 @@ def without_outliers(trial: Trial) -> Trial:
     if not dropped:
         return trial
     note = f"{len(dropped)} closure(s) far from the others are left out, starting at " + ", ".join(
-        f"{max(c.start, 0.0):.1f} s" for c in dropped
+        f"{max(c.start, 0.0):.1f} s{_missing(trial, c)}" for c in dropped
     )
     return replace(trial, closures=tuple(sorted(kept, key=lambda c: c.start)), notes=(*trial.notes, note))
+
+
+def _missing(trial: Trial, closure: Closure) -> str:
+    """Of which signals samples are missing in a closure, behind its start."""
+    short = [n for n, (time, _) in trial.signals.items() if misses_samples(time, closure.start, closure.stop)]
+    return f" (samples of {' and '.join(short)} are missing in it)" if short else ""
 
 
 def prepare(
