@@ -7,6 +7,9 @@ from hannes_description.errors import HannesError
 from hannes_description.model import EffectEntry, Model
 from hannes_description.parameters import Parameter, ParameterSet, load_parameters
 from hannes_sim.effect import load_effect
+from hannes_sim.factory import make_plant
+
+OTHER_UNIT = "{value: 10, unit: mN.m, lower: 0, upper: 100, status: assumed, source: x}"
 
 
 def test_every_shipped_number_has_unit_bounds_status_and_source() -> None:
@@ -45,6 +48,7 @@ def test_the_hash_tells_simulations_apart_not_names() -> None:
         ("schema: hannes/model/1\nspeed: 3\n", r"unknown keys \['speed'\]"),
         ("schema: hannes/model/1\noverrides: {motor.resistence: {value: 1}}\n", r"motor\.resistance"),
         ("schema: hannes/model/1\noverrides: {motor.resistance: {value: 1}}\n", "missing keys"),
+        (f"schema: hannes/model/1\noverrides: {{friction.coulomb: {OTHER_UNIT}}}\n", "must be in 'N.m'"),
         ("schema: hannes/model/1\nparameters: nobody\n", "shipped are"),
         ("schema: hannes/model/1\neffects: [{name: x}]\n", "every effect needs"),
         ("schema: [\n", "not valid YAML"),
@@ -95,6 +99,16 @@ def test_an_effect_twice_is_refused() -> None:
     entry = EffectEntry("a", {})
     with pytest.raises(HannesError, match="listed twice"):
         Model("m", "reduced", load_parameters("hannes"), effects=(entry, entry))
+
+
+def test_what_a_model_file_overrides_is_told_by_its_own_name(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    for value in (0, -1e-6):
+        entry = f"{{value: {value}, unit: kg.m2, lower: -1, upper: 1, status: assumed, source: x}}"
+        file.write_text(f"schema: hannes/model/1\noverrides: {{motor.armature: {entry}}}\n")
+        with pytest.raises(HannesError, match=r"armature is .* more than 0") as caught:
+            make_plant(Model.load(file))
+        assert str(caught.value).startswith(f"{file}: ")
 
 
 def test_unreadable_and_missing_files(tmp_path: Path) -> None:

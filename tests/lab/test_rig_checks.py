@@ -169,11 +169,16 @@ def test_what_the_class_says_wrongly_is_refused(lab: Lab, more: str, said: str) 
 def test_what_the_class_leaves_out_is_said(lab: Lab) -> None:
     code, out, _ = lab(more="sizes = {}")
     assert code == 0 and "Mine gives no `sizes`" in out and "0.05 N.m, 14.57 rad" in out
+
+
+def test_units_that_a_turning_machine_does_not_take_are_refused(lab: Lab) -> None:
     with_model(
         lab, armature="  armature: {value: 2, unit: g, lower: 1, upper: 9, status: assumed, source: x}"
     )
     assert "armature" not in lab()[1], "of a linear machine a mass may come in other units"
-    assert "motor.armature is given in 'g' and taken as kg.m2" in lab(more="linear = False")[1]
+    told = lab.refused(more="linear = False")
+    assert f"{lab.here / 'parameters.yaml'}: parameter 'motor.armature' is in 'g'" in told
+    assert "takes 'kg.m2': convert value, lower and upper" in told
 
 
 def test_a_recording_that_is_not_there_is_refused(lab: Lab) -> None:

@@ -190,8 +190,13 @@ class Model:
             raise HannesError(f"{where}: 'overrides' must map parameter names to entries.")
         changed = dict(parameters.entries)
         for name, entry in overrides.items():
-            parameters[str(name)]  # unknown names are refused here, with the valid ones listed
-            changed[str(name)] = Parameter.from_dict(str(name), entry, where)
+            own = parameters[str(name)]  # unknown names are refused here, with the valid ones listed
+            given = changed[str(name)] = Parameter.from_dict(str(name), entry, where)
+            if given.unit != own.unit:
+                raise HannesError(
+                    f"{where}: parameter '{name}' is in '{given.unit}'; it must be in '{own.unit}', as in {base}: "
+                    "convert value, lower and upper."
+                )
         variant = content.get("variant") or {}
         provenance = content.get("provenance") or {}
         if not isinstance(variant, Mapping) or not isinstance(provenance, Mapping):
@@ -199,7 +204,7 @@ class Model:
         return cls(
             name=str(content.get("name", path.stem)),
             plant=_beside(str(content.get("plant", "reduced")), path.parent),
-            parameters=ParameterSet(changed, parameters.source),
+            parameters=ParameterSet(changed, parameters.source, {str(name): where for name in overrides}),
             base=str(base_path),
             controller=_beside(str(content.get("controller", "double_pid")), path.parent),
             variant=variant,

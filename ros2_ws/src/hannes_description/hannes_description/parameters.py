@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
@@ -103,10 +103,15 @@ class Parameter:
 
 @dataclass(frozen=True)
 class ParameterSet(Mapping[str, Parameter]):
-    """Parameters by dotted name, such as `motor.resistance`; immutable."""
+    """Parameters by dotted name, such as `motor.resistance`; immutable.
+
+    source   the file that they are from
+    origins  the file of those that are from another one, by name
+    """
 
     entries: Mapping[str, Parameter]
     source: str = "memory"
+    origins: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
     _hash: list[str] = field(default_factory=list, repr=False, compare=False)
 
     def __getitem__(self, name: str) -> Parameter:
@@ -134,12 +139,24 @@ class ParameterSet(Mapping[str, Parameter]):
         """The value of one parameter in its unit."""
         return self[name].value
 
+    def origin(self, name: str) -> str:
+        """The file that gives a parameter its value."""
+        return self.origins.get(name, self.source)
+
     def require(self, needs: Mapping[str, Sequence[str]]) -> None:
         """Raise one HannesError that names all parameters that are not there, by who needs them."""
         missing = {who: [name for name in names if name not in self] for who, names in needs.items()}
         said = [f"{', '.join(names)} ({who} cannot do without)" for who, names in missing.items() if names]
         if said:
             raise HannesError(f"{self.source}: missing parameters: {'; '.join(said)}.")
+
+    def require_positive(self, names: Iterable[str], who: str) -> None:
+        """Raise a HannesError for the first of the named parameters, where it is there, that is not above 0."""
+        for name in names:
+            if name in self and self.value(name) <= 0.0:
+                raise HannesError(
+                    f"{self.origin(name)}: {name} is {self.value(name):g} {self[name].unit}; {who} needs more than 0."
+                )
 
     def values_of(self, group: str) -> dict[str, float]:
         """All values of a group, by the name after the dot: `values_of("motor")["resistance"]`."""
@@ -153,7 +170,7 @@ class ParameterSet(Mapping[str, Parameter]):
     ) -> ParameterSet:
         """A new set in which the named parameters have other values."""
         changed = {name: self[name].at(value, status=status, source=source) for name, value in values.items()}
-        return ParameterSet({**self.entries, **changed}, self.source)
+        return replace(self, entries={**self.entries, **changed}, _hash=[])
 
     def to_dict(self) -> dict[str, Any]:
         return {name: parameter.to_dict() for name, parameter in self.entries.items()}

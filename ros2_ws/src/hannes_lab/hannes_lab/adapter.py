@@ -42,9 +42,6 @@ SHORTEST = 3.0
 OTHER_MOVE = 0.3
 """Mean difference of the references of two closures, in what they go over, from which one does not repeat the other."""
 
-TYPED = ("motor.armature", "motor.resistance", "motor.inductance", "friction.coulomb", "friction.viscous")
-"""Parameters whose unit on a turning machine can only be one."""
-
 
 def check_rig(rig: Rig, model: Model) -> list[str]:
     """Refuse what an adapter's class says wrongly, and give what it leaves out, in sentences."""
@@ -72,11 +69,6 @@ def check_rig(rig: Rig, model: Model) -> list[str]:
         notes.append(
             f"{who} gives no `sizes`: the effects of the catalogue have bounds and typical values of a drive of {usual}"
         )
-    hand = Model.load().parameters
-    for name in TYPED if not rig.linear else ():
-        if name in model.parameters and model.parameters[name].unit != hand[name].unit:
-            given = model.parameters[name].unit
-            notes.append(f"{name} is given in '{given}' and taken as {hand[name].unit}: is that what it is?")
     return notes
 
 

@@ -22,7 +22,7 @@ from hannes_description.model import Model
 from hannes_description.parameters import read_yaml
 from hannes_sim import reduced
 from hannes_sim.effect import EffectType, call_own, catalogue, load_class
-from hannes_sim.factory import make_plant
+from hannes_sim.factory import PLANTS, make_plant
 from hannes_sim.plant import Plant
 from hannes_sim.rollout import Controller, Rollout, rollout, step_of
 from numpy.typing import NDArray
@@ -403,7 +403,8 @@ def make_controller(model: Model, period: float) -> Controller:
 
 
 def check_parameters(rig: Rig, model: Model) -> None:
-    """Raise one HannesError that names all parameters which the model's plant and control law lack."""
+    """Raise one HannesError that names all parameters which the model's plant and control law lack, or one in a unit
+    that they do not take."""
     own_law = isinstance(rig, PlantRig) and type(rig).controller is not PlantRig.controller
     needs = {
         "the reduced plant": reduced.NEEDED if model.plant == "reduced" else (),
@@ -412,6 +413,27 @@ def check_parameters(rig: Rig, model: Model) -> None:
         else (),
     }
     model.parameters.require(needs)
+    if isinstance(rig, PlantRig) and not rig.linear and model.plant in PLANTS:
+        _check_units(model, control=bool(needs["the control law double_pid"]))
+
+
+def _check_units(model: Model, *, control: bool) -> None:
+    """Units of a turning machine, as the shipped plants take them; `control` where their control law is used too.
+
+    A linear machine's are only those that go together.
+    """
+    theirs, parameters = Model.load().parameters, model.parameters
+    for name in parameters:
+        if name not in theirs or (name.startswith("control.") and not control):
+            continue
+        given, wanted = parameters[name].unit, theirs[name].unit
+        # Without a resistance the command may be a current or a torque, and nothing is in volts or amperes.
+        free = "motor.resistance" not in parameters and any(token in "VA" for token, _ in _tokens(wanted))
+        if not (free or _same(given, wanted)):
+            raise HannesError(
+                f"{parameters.origin(name)}: parameter '{name}' is in '{given}'; the plant '{model.plant}' takes "
+                f"'{wanted}': convert value, lower and upper."
+            )
 
 
 def _check_compiled(made: Plant | Controller, what: str) -> None:
@@ -472,6 +494,34 @@ def _tokens(unit: str) -> list[tuple[str, float]]:
                 name = {"T": "N.m", "J": "kg.m2"}.get(match.group(1), match.group(1))
                 out.append((name, power))
     return out
+
+
+_SI = {
+    "N.m": (1, 2, -2, 0),
+    "kg.m2": (1, 2, 0, 0),
+    "N": (1, 1, -2, 0),
+    "V": (1, 2, -3, -1),
+    "ohm": (1, 2, -3, -2),
+    "H": (1, 2, -2, -2),
+    "kg": (1, 0, 0, 0),
+    "m": (0, 1, 0, 0),
+    "s": (0, 0, 1, 0),
+    "A": (0, 0, 0, 1),
+    "rad": (0, 0, 0, 0),
+}
+"""Exponents of kg, m, s and A: units of SI that have the same are the same, as N.m/A and V.s/rad are."""
+
+
+def _same(unit: str, other: str) -> bool:
+    """Whether a number means the same in both units."""
+
+    def powers(unit: str) -> list[float] | None:
+        tokens = _tokens(unit)
+        if (unit != "1" and not tokens) or any(token not in _SI for token, _ in tokens):
+            return None
+        return [sum(power * _SI[token][k] for token, power in tokens) for k in range(4)]
+
+    return unit == other or (powers(unit) is not None and powers(unit) == powers(other))
 
 
 def unit_factor(unit: str, sizes: Mapping[str, float]) -> float:

@@ -50,7 +50,7 @@ from .effect import BoundEffects
 from .motor import begin_step, evaluate_effects, motor_torque, sense
 from .native import ADVANCE_SIGNATURE, call_2, pointer_f8, pointer_i8
 from .objects import GraspObject
-from .plant import DEFAULT_DT, PlantDiverged, Reading
+from .plant import DEFAULT_DT, POSITIVE, PlantDiverged, Reading
 from .ports import (
     COMPLIANCE,
     CONTACT,
@@ -304,6 +304,7 @@ class MujocoPlant:
         self.variant = Variant.of(model.variant)
         self.grasp = grasp
         self._values = model.parameters
+        self._values.require_positive(POSITIVE, "the multi-body plant")
         self._scaled = {
             name: self._values.value(name) if name in self._values else given
             for name, given in _SCALED.items()

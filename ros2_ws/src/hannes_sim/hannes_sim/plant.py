@@ -24,6 +24,10 @@ DEFAULT_DT = 0.25e-3
 """s; the step for use. Identification and convergence checks halve it."""
 
 
+POSITIVE = ("supply.voltage", "motor.kt", "motor.armature", "motor.resistance", "gear.ratio")
+"""Parameters of a drive that is there: without one of them above 0 nothing moves, or everything at once."""
+
+
 class PlantDiverged(HannesError, RuntimeError):
     """The simulation became unstable or non-finite; the message names the time and the coordinate."""
 

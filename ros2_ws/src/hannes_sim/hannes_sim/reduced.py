@@ -29,7 +29,7 @@ from .effect import BoundEffects
 from .motor import begin_step, dry_friction, evaluate_effects, motor_torque, sense
 from .native import ADVANCE_SIGNATURE, pointer_f8
 from .objects import GraspObject
-from .plant import DEFAULT_DT, PlantDiverged, Reading
+from .plant import DEFAULT_DT, POSITIVE, PlantDiverged, Reading
 from .ports import (
     COMPLIANCE,
     CONTACT,
@@ -255,6 +255,7 @@ class ReducedPlant:
         self.parameters[P_DT] = dt
         values = model.parameters
         values.require({"the reduced plant": NEEDED})
+        values.require_positive(POSITIVE, "the reduced plant")
         # A drive without a gearbox, or whose command is a current, need not name these.
         self.parameters[[P_RATIO, P_EFFICIENCY, P_RESISTANCE]] = 1.0
         for name, index in _NAMES.items():
@@ -264,9 +265,6 @@ class ReducedPlant:
             "control.motor_kt" if "control.motor_kt" in values else "motor.kt"
         )
         self._armature = values.value("motor.armature")
-        for name in (*NEEDED, "gear.ratio", "motor.resistance"):
-            if self.get(name) == 0.0:
-                raise HannesError(f"{values.source}: {name} is 0; the reduced plant cannot move so.")
         self._update_inertia()
         self.parameters[_OBJECT_AT] = NO_OBJECT
         self.parameters[_LOWEST] = NO_LOWEST
