@@ -177,6 +177,17 @@ while True:
     assert topic["messages"] > 10 and 50 < topic["rate"] < 150 and topic["age"] < 0.5
 
 
+@pytest.mark.ros
+def test_a_profile_without_a_hand_is_refused_before_anything_is_recorded(
+    ros_environment: dict[str, str], tmp_path: Path
+) -> None:
+    bag = tmp_path / "bag"
+    told = hannes("record", str(bag), "--profile", "half_sine", "--closures", "1", env=ros_environment)
+    assert told.returncode == 2 and len(told.stderr.strip().splitlines()) == 1, told.stderr
+    assert "No motor/state is seen in ROS domain" in told.stderr and "is hand_sim" in told.stderr
+    assert not bag.exists()
+
+
 def test_the_demo_says_what_was_noticed_in_a_bag_in_a_line(tmp_path: Path) -> None:
     from bags.bag_samples import foreign_bag, motor_messages
     from hannes_bringup.cli.demo import _read

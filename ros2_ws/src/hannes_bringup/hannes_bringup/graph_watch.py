@@ -9,6 +9,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from hannes_description.errors import HannesError
+from hannes_description.signals import SIGNALS
+from hannes_ros.node import DEFAULT_NAMESPACE
 from rclpy.context import Context
 from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
@@ -20,6 +23,7 @@ from .visitor import visit
 
 QUIET, LONGEST = 0.5, 3.0
 """s: discovery is over when no topic or node was added for QUIET, or after LONGEST."""
+HAND = f"/{DEFAULT_NAMESPACE}/{SIGNALS['encoder_position'].topic}"
 HIDDEN = ("/parameter_events", "/rosout")
 LEVELS = {b"\x00": "ok", b"\x01": "warn", b"\x02": "error", b"\x03": "stale"}
 
@@ -81,6 +85,19 @@ def watch(window: float, context: Context | None = None) -> GraphSeen:
     """Watch the graph for `window` seconds (plus discovery), without disturbing it: best-effort, raw subscriptions."""
     with visit("nodes", EventsExecutor, context) as (node, executor):
         return _watch(node, executor, window)
+
+
+def require_hand(timeout: float) -> None:
+    """Raise a HannesError where no hand is found within `timeout` seconds: nobody who publishes motor/state."""
+    with visit("peers", EventsExecutor) as (node, executor):
+        end = time.monotonic() + timeout
+        while not node.count_publishers(HAND):
+            if time.monotonic() > end:
+                raise HannesError(
+                    f"No motor/state is seen in ROS domain {node.context.get_domain_id()}: is hand_sim, or the motor "
+                    "board, running? (`hannes run hand_sim` starts one.)"
+                )
+            _spin(executor, 0.05)
 
 
 def _watch(node: Node, executor: Executor, window: float) -> GraphSeen:

@@ -55,6 +55,8 @@ def record(
         _become("recorder", parameters, more or [])
 
 
+SEEK = 5.0
+"""s in which a hand that runs is found."""
 SETTLE = 3.0
 """s in which recorder and controller find the hand before, and in which the last messages come in after a profile."""
 
@@ -67,7 +69,7 @@ def _record_profile(
 
     from hannes_control.reference import make_profile
 
-    from hannes_bringup.environment import require_ros, ros_environment
+    from hannes_bringup.environment import apply_ros_environment, require_ros, ros_environment
     from hannes_bringup.processes import Interrupted, ProcessGroup, raise_on_signals
     from hannes_bringup.ros2_standin import find_command
 
@@ -78,6 +80,10 @@ def _record_profile(
     controller: dict[str, Any] = {"reference": profile, "reference_closures": closures}
     controller |= {f"reference_{name}": value for name, value in given.items()}
     require_ros()
+    apply_ros_environment()
+    from hannes_bringup.graph_watch import require_hand
+
+    require_hand(SEEK)
     environment = ros_environment()
     raise_on_signals()
     with ProcessGroup(lambda text: typer.echo(text, err=True), environment) as group:
