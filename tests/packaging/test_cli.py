@@ -104,6 +104,10 @@ def test_model_show_says_where_every_number_comes_from() -> None:
         (("run", "graph", "speed:=3"), "no argument 'speed'"),
         (("run", "graph", "speed"), "name:=value"),
         (("model", "show", "--nonsense"), "--nonsense"),
+        *(
+            (("record", "/tmp/never", "--profile", name, "--amplitude", "100"), "closed at 15.6 rad")
+            for name in ("half_sine", "ramp_hold", "reversals")
+        ),
         (("sing",), "sing"),
     ],
 )

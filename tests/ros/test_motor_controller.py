@@ -95,6 +95,12 @@ def test_another_period_than_the_simulator_s_is_one_clear_error(peer):
     assert len(voltages(peer)) == 1
 
 
+def test_a_profile_beyond_the_travel_of_the_hand_is_refused(ros_environment):
+    with processes(NodeProcess(NAME, reference="ramp_hold", reference_amplitude=20.0)) as (node,):
+        assert node.wait() == 2
+        assert "amplitude is 20 rad, but the hand is fully closed at 15.6 rad" in node.output
+
+
 def test_wrong_joint_and_not_finite_inputs_are_rejected_and_counted(peer):
     peer.hear("motor_voltage")
     peer.hear_diagnostics()

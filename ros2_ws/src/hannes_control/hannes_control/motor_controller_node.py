@@ -19,7 +19,7 @@ from hannes_ros.run import run_node
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from .double_pid import DoublePID
-from .reference import FULL_CLOSURE, PROFILES, Profile, make_profile
+from .reference import FULL_CLOSURE, PROFILES, Profile, check_travel, make_profile
 
 _CHECK_S = 0.02
 _ZERO = convert.float64_bytes(0.0)
@@ -95,6 +95,8 @@ class MotorController(HannesNode, LifecycleNode):
         self._pid = DoublePID.of_model(model.parameters, p.period)
         self._limit = self._pid.settings.voltage_limit
         self._profile = p.profile()
+        if self._profile is not None:
+            check_travel(p.reference_amplitude, model.parameters)
         self._lockstep = p.clock == "lockstep"
         self._active = self._tripped = False
         self._health = Health("rejected_states", "rejected_inputs", "state_timeouts", "trips", "resets")

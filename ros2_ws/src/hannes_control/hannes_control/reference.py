@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.joints import RAD_PER_COUNT
+from hannes_description.parameters import ParameterSet
 from numpy.typing import NDArray
 
 FULL_CLOSURE = 40000 * RAD_PER_COUNT
@@ -83,6 +84,16 @@ PROFILES: Mapping[str, Callable[..., Profile]] = {
     "reversals": reversals,
 }
 """Profiles by name, for nodes and the command line."""
+
+
+def check_travel(amplitude: float, parameters: ParameterSet) -> None:
+    """Refuse an amplitude (rad) beyond the hand's travel, where the parameters say it: the motor would stall there."""
+    travel = parameters.value("hand.travel") if "hand.travel" in parameters else math.inf
+    if amplitude > travel:
+        raise HannesError(
+            f"Reference profile: amplitude is {amplitude:g} rad, but the hand is fully closed at {travel:g} rad "
+            "(hand.travel of the model), where the motor would stall: give less."
+        )
 
 
 def make_profile(name: str, **options: float) -> Profile:

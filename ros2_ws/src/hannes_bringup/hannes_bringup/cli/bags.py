@@ -67,7 +67,8 @@ def _record_profile(
     """Recorder and controller as child processes for as long as the profile lasts."""
     import time
 
-    from hannes_control.reference import make_profile
+    from hannes_control.reference import check_travel, make_profile
+    from hannes_description.model import Model
 
     from hannes_bringup.environment import apply_ros_environment, require_ros, ros_environment
     from hannes_bringup.processes import Interrupted, ProcessGroup, raise_on_signals
@@ -77,6 +78,7 @@ def _record_profile(
 
     given = {name: value for name, value in (("period", period), ("amplitude", amplitude)) if value > 0.0}
     seconds = make_profile(profile, closures=closures, **given).size * 1e-3
+    check_travel(amplitude, Model.load().parameters)
     controller: dict[str, Any] = {"reference": profile, "reference_closures": closures}
     controller |= {f"reference_{name}": value for name, value in given.items()}
     require_ros()
