@@ -160,6 +160,14 @@ def test_numbers_may_come_as_lists(lab: Lab) -> None:
         ("sizes = {'Nm': 3.0}", "Mine.sizes: 'Nm': 3.0; it takes positive numbers for N.m, rad, V, A, s"),
         ("sizes = {'N.m': -3.0}", "Mine.sizes: 'N.m': -3.0"),
         ("without = {'gravitation': 'level'}", "no effect of the catalogue; is 'gravity' meant?"),
+        ("without = ['gravity']", "Mine.without is a list; it takes a mapping of effects to reasons"),
+        ("points = 1", "Mine.points is 1; it is how many points of a closure are compared at most"),
+        ("floor = -1.0", "Mine.floor is -1.0; it is a part of a signal's span"),
+        ("drive_signals = 'drive_force'", "Mine.drive_signals is 'drive_force'; it takes a tuple of names"),
+        (
+            "drive_signals = ('drive_forse',)",
+            "they have drive_force, encoder_position: is 'drive_force' meant?",
+        ),
     ],
 )
 def test_what_the_class_says_wrongly_is_refused(lab: Lab, more: str, said: str) -> None:
@@ -169,6 +177,27 @@ def test_what_the_class_says_wrongly_is_refused(lab: Lab, more: str, said: str) 
 def test_what_the_class_leaves_out_is_said(lab: Lab) -> None:
     code, out, _ = lab(more="sizes = {}")
     assert code == 0 and "Mine gives no `sizes`" in out and "0.05 N.m, 14.57 rad" in out
+
+
+@pytest.mark.parametrize(
+    ("tolerances", "said"),
+    [
+        ("", "there are no tolerances in it; give a line for each uncertain parameter"),
+        ("- motor.armature", "there are no tolerances in it"),
+        ("motor.armature: [0.1]", "'motor.armature' needs the numbers sd and closure_sd"),
+        ("motor.armature: {sd: -0.1, closure_sd: 0, unit: kg}", "'motor.armature': sd is -0.1; it must be"),
+        ("friction.viscous: {sd: 0.1, closure_sd: 0, unit: '1'}", "but is 0 N.s/m in "),
+    ],
+)
+def test_tolerances_that_are_none_are_refused_by_their_file(lab: Lab, tolerances: str, said: str) -> None:
+    with_model(
+        lab,
+        friction="friction: {viscous: {value: 0, unit: N.s/m, lower: 0, upper: 50, status: assumed, source: x}}",
+    )
+    file = lab.here / "mine.yaml"
+    file.write_text(tolerances)
+    told = lab.refused(more=f"population = property(lambda self: {str(file)!r})")
+    assert told.startswith(f"hannes: {file}: ") and said in told
 
 
 def test_units_that_a_turning_machine_does_not_take_are_refused(lab: Lab) -> None:

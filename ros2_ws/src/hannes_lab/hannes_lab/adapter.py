@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.signals import SIGNALS
 from hannes_sim.effect import catalogue
 from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
@@ -39,6 +40,9 @@ FAR_OFF = 100.0
 SHORTEST = 3.0
 """Control periods that a closure lasts at least."""
 
+FEWEST = 2
+"""Points to a closure with which there is anything to compare."""
+
 OTHER_MOVE = 0.3
 """Mean difference of the references of two closures, in what they go over, from which one does not repeat the other."""
 
@@ -48,6 +52,8 @@ def check_rig(rig: Rig, model: Model) -> list[str]:
     if not isinstance(rig, PlantRig):
         return []
     who, sizes = type(rig).__name__, dict(rig.sizes)
+    _check_grid(rig, who)
+    _check_drive(rig, who)
     for token, size in sizes.items():
         if token not in REFERENCE_SIZES or not (_finite(size) and size > 0.0):
             raise HannesError(
@@ -70,6 +76,35 @@ def check_rig(rig: Rig, model: Model) -> list[str]:
             f"{who} gives no `sizes`: the effects of the catalogue have bounds and typical values of a drive of {usual}"
         )
     return notes
+
+
+def _check_grid(rig: PlantRig, who: str) -> None:
+    if not (isinstance(rig.points, int | np.integer) and rig.points >= FEWEST):
+        raise HannesError(
+            f"{who}.points is {rig.points!r}; it is how many points of a closure are compared at most: a whole number, "
+            f"at least {FEWEST}."
+        )
+    if not (_finite(rig.floor) and rig.floor > 0.0):
+        raise HannesError(
+            f"{who}.floor is {rig.floor!r}; it is a part of a signal's span, such as 2e-4: a number above 0."
+        )
+
+
+def _check_drive(rig: PlantRig, who: str) -> None:
+    """Refuse names of drive signals that are no names, or another's misspelt."""
+    names = rig.drive_signals
+    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
+        raise HannesError(
+            f"{who}.drive_signals is {names!r}; it takes a tuple of names, such as ('motor_current',) with its comma."
+        )
+    recorded = dict.fromkeys(s for trial in rig.trials for s in trial.signals)
+    for name in names:
+        near = get_close_matches(name, recorded, 1, 0.8)
+        if near and name not in (*SIGNALS, "motor_effort", *recorded):
+            raise HannesError(
+                f"{who}.drive_signals names '{name}', which is no signal of the recordings; they have "
+                f"{', '.join(recorded)}: is '{near[0]}' meant?"
+            )
 
 
 def _finite(value: Any) -> bool:

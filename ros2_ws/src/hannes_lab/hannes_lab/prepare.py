@@ -245,7 +245,10 @@ def prepare(
         )
     if not any(signal in present for signal in rig.drive_signals):
         drive = rig.drive_signals[0].removeprefix("motor_").replace("_", " ")
-        notes.append(f"no {drive} is recorded: friction, torque constant and inertia are hard to tell apart")
+        only = f" (only {', '.join(present)})" if strange else ""
+        notes.append(
+            f"no {drive} is recorded{only}: friction, torque constant and inertia are hard to tell apart"
+        )
     if "encoder_position" not in present:
         notes.append(
             "no encoder position is recorded: sensor offsets, slack and backlash cannot be told apart"

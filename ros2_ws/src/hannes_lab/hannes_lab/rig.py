@@ -189,7 +189,13 @@ class PlantRig:
 
     def __init__(self, trials: Sequence[Trial]) -> None:
         self.trials = tuple(trials)
-        self.without = {**self._unknown(), **type(self).without}
+        without = type(self).without
+        if not isinstance(without, Mapping):
+            raise HannesError(
+                f"{type(self).__name__}.without is a {type(without).__name__}; it takes a mapping of effects to "
+                'reasons, such as {"gravity": "the axis is level"}.'
+            )
+        self.without = {**self._unknown(), **without}
         self._plants: dict[tuple[str, ...], tuple[Plant, Controller, dict[str, float]]] = {}
         self._signals: OrderedDict[tuple[Any, ...], dict[str, Array]] = OrderedDict()
         self._came_back = True
@@ -231,23 +237,35 @@ class PlantRig:
                 "says which parameters are uncertain, and by how much."
             )
         table = read_yaml(Path(self.population), "file of tolerances")
+        if not isinstance(table, Mapping) or not table:
+            raise HannesError(
+                f"{self.population}: there are no tolerances in it; give a line for each uncertain parameter, such as "
+                '`motor.kt: {sd: 0.03, closure_sd: 0.0, unit: "1", source: magnets}`.'
+            )
         return [self._nuisance(name, entry, model) for name, entry in table.items()]
 
     def _nuisance(self, name: str, entry: Mapping[str, Any], model: Model) -> Nuisance:
         try:
             sd, scatter = float(entry.get("sd", entry.get("hand_sd"))), float(entry["closure_sd"])
             relative = str(entry["unit"]) == "1"
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise HannesError(
                 f"{self.population}: '{name}' needs the numbers sd and closure_sd, and a unit ({error})."
             ) from error
+        if not (math.isfinite(sd) and sd > 0.0):
+            raise HannesError(f"{self.population}: '{name}': sd is {sd:g}; it must be a number above 0.")
         if name == REFERENCE_DELAY:
             if str(entry["unit"]) != "s":
                 raise HannesError(f"{self.population}: '{name}' is a time in s, not in {entry['unit']!r}.")
             return Nuisance(name, 0.0, sd, False, scatter, "s")
         own = model.named(name)
         unit, mean = own.unit, own.value
-        if relative and sd <= NARROW and mean > 0.0:
+        if relative and mean <= 0.0:
+            raise HannesError(
+                f"{self.population}: '{name}' has a relative tolerance (unit \"1\"), but is {mean:g} {unit} in "
+                f"{model.parameters.origin(name)}: give it a value above 0, or a tolerance in {unit!r}."
+            )
+        if relative and sd <= NARROW:
             return Nuisance(name, mean, sd * mean, False, scatter * mean, unit, lower=LEAST * mean)
         return Nuisance(name, mean, sd, relative, scatter, unit)
 
