@@ -441,12 +441,13 @@ def _check_units(model: Model, *, control: bool) -> None:
     A linear machine's are only those that go together.
     """
     theirs, parameters = Model.load().parameters, model.parameters
+    # Without a resistance or a back-EMF the command may be a current or a torque, and nothing is in volts or amperes.
+    volts = "motor.resistance" in parameters and "motor.emf_compensated" not in parameters
     for name in parameters:
         if name not in theirs or (name.startswith("control.") and not control):
             continue
         given, wanted = parameters[name].unit, theirs[name].unit
-        # Without a resistance the command may be a current or a torque, and nothing is in volts or amperes.
-        free = "motor.resistance" not in parameters and any(token in "VA" for token, _ in _tokens(wanted))
+        free = not volts and any(token in ("V", "A", "ohm") for token, _ in _tokens(wanted))
         if not (free or _same(given, wanted)):
             raise HannesError(
                 f"{parameters.origin(name)}: parameter '{name}' is in '{given}'; the plant '{model.plant}' takes "
