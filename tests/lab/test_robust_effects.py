@@ -17,7 +17,7 @@ EFFECT = '''
 import math
 
 from hannes_sim.effect import Effect, EffectParameter
-from hannes_sim.ports import FRICTION, TORQUE, Q, V
+from hannes_sim.ports import FRICTION, TORQUE, Q, T, V
 
 
 class Mine(Effect):
@@ -35,6 +35,8 @@ class Mine(Effect):
 HANG = "k = 0.0\n        while k < 1.0:\n            k -= 1.0 + p[0]\n        y[FRICTION] += k"
 ROOT = "y[FRICTION] += p[0] * math.sqrt(5.0 - x[Q])"
 DIVISION = "y[FRICTION] += p[0] / (x[Q] - x[Q])"
+RARE = "if 0.4 < x[T] < 0.401:\n            raise ValueError('rare')\n        y[FRICTION] += p[0]"
+LATE = "if x[T] > 6.0:\n            raise ValueError('late')\n        y[FRICTION] += p[0]"
 STRONG = "y[TORQUE] += 1e9 * p[0] * x[V]"
 
 
@@ -57,6 +59,8 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (DIVISION, "gives NaN or infinity"),
         (STRONG, "Is the typical value too strong?"),
         ("y[FRICTION] += undefined", "cannot be compiled"),
+        ("print(p[0])", "contribute(x, p, s, y) calls print, or something else that needs Python"),
+        (RARE, "failed at t = 0.4"),
     ],
 )
 def test_a_bad_effect_is_one_clear_error(
@@ -75,6 +79,20 @@ def test_a_bad_effect_is_one_clear_error(
     ):
         code, _, err = hannes_in_one_line(*words, capsys=capsys, monkeypatch=monkeypatch)
         assert code == 2 and said in err and len(err.strip().splitlines()) == 1
+    assert not out.exists() and not truth.exists()
+
+
+def test_an_effect_that_raises_late_ends_the_command(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An exception cannot leave a C function: it was printed at every step, and the set was written all the same."""
+    out, truth = tmp_path / "out", tmp_path / "truth.yaml"
+    words = ("hide", str(out), "--truth", str(truth), "--effect", effect_file(tmp_path, LATE))
+    code, _, err = hannes_in_one_line(*words, capsys=capfd, monkeypatch=monkeypatch)
+    assert code == 2 and len(err.strip().splitlines()) == 1
+    assert (
+        "'mine'" in err and "failed at t = 6" in err and "ValueError: late" in err and "mine.py, line" in err
+    )
     assert not out.exists() and not truth.exists()
 
 

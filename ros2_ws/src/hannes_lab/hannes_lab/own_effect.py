@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 from hannes_description.errors import HannesError
-from hannes_sim.effect import EffectType, compile_effect, load_effect
+from hannes_sim.effect import ContributeFailed, EffectType, compile_effect, load_effect
 from hannes_sim.ports import DT, N_INPUTS, N_OUTPUTS, QL, VL, Q, T, V
 from numpy.typing import NDArray
 
@@ -77,7 +77,8 @@ def _try(source: str, simulate: Simulate, motion: tuple[Array, Array], answer: C
         try:
             simulate(source)
         except HannesError as error:
-            said = f"'{source}' with its typical values: {error} Is the typical value too strong?"
+            strong = "" if isinstance(error, ContributeFailed) else " Is the typical value too strong?"
+            said = f"'{source}' with its typical values: {error}{strong}"
     answer.send(said)
     answer.close()
 

@@ -24,8 +24,10 @@ from hannes_description.parameters import Parameter
 from numba import cfunc
 from numpy.typing import NDArray
 
-from .native import EFFECT_SIGNATURE
+from .native import EFFECT_SIGNATURE, needs_python
 from .ports import N_INPUTS, N_OUTPUTS
+
+NEEDS_PYTHON = "calls print, or something else that needs Python, which compiled code has not"
 
 ENTRY_POINTS = "hannes.effects"
 """Entry-point group in which another package offers its effects."""
@@ -227,7 +229,7 @@ def load_effect(name_or_source: str) -> EffectType:
     return check_effect(effect, f"{file}, class {class_name}")
 
 
-def reason(error: Exception) -> str:
+def reason(error: BaseException) -> str:
     """One line of what an error says; numba's, which are long, with what it is about and where."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     said = [line for line in lines if not line.startswith("Failed in nopython mode")]
@@ -282,12 +284,15 @@ def load_class(file: str, class_name: str, what: str) -> Any:
 def compile_effect(effect: EffectType) -> Any:
     """The compiled C function of an effect (kept alive by the cache); `.address` is what a plant calls."""
     try:
-        return cfunc(EFFECT_SIGNATURE, cache=_cacheable(effect))(effect.contribute)
+        compiled = cfunc(EFFECT_SIGNATURE, cache=_cacheable(effect))(effect.contribute)
     except Exception as error:  # numba's errors are long; the user needs the effect and the reason
         raise HannesError(
             f"Effect '{effect.name}': contribute(x, p, s, y) cannot be compiled: {reason(error)} "
             "(plain arithmetic, math functions and the constants of hannes_sim.ports are allowed)."
         ) from error
+    if needs_python(compiled):
+        raise HannesError(f"Effect '{effect.name}': contribute(x, p, s, y) {NEEDS_PYTHON}; take it out.")
+    return compiled
 
 
 def _cacheable(effect: EffectType) -> bool:
@@ -311,6 +316,10 @@ def effect_of(entry: EffectEntry) -> EffectType:
             f"Effect '{kind.name}' of the model {' and '.join(wrong)}; its parameters are {', '.join(names)}."
         )
     return kind
+
+
+class ContributeFailed(HannesError):
+    """An effect raised an exception while it ran; the message names effect, time and reason."""
 
 
 class BoundEffects:
@@ -344,6 +353,14 @@ class BoundEffects:
     def set(self, effect: str, parameter: str, value: float) -> None:
         """Change one parameter of an active effect."""
         self.parameters[self.index[(effect, parameter)]] = value
+
+    def failed(self, said: str, time: float) -> ContributeFailed:
+        """The error of an effect that raised an exception at a time [s]."""
+        own = [effect.name for effect in self.effects if effect.name not in catalogue()]
+        which = "' or '".join(own or [effect.name for effect in self.effects])
+        return ContributeFailed(
+            f"Effect '{which}': contribute(x, p, s, y) failed at t = {time:.4g} s: {said}."
+        )
 
     @classmethod
     def of(cls, entries: tuple[EffectEntry, ...]) -> BoundEffects:

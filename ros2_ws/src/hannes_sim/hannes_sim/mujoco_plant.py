@@ -102,6 +102,7 @@ from .ports import (
     TORQUE,
     VL,
 )  # fmt: skip
+from .raised import watched
 
 # Parameters of this plant, after the common ones
 _RADIUS, _COULOMB, _VISCOUS, _TIP, _WIRE_K, _WIRE_B, _WIRE_GAIN, _OBJECT_K, _OBJECT_B = range(
@@ -558,7 +559,10 @@ class MujocoPlant:
         self._call(self._handle_pointer, 0.0, 0)
 
     def advance(self, voltage: float, steps: int) -> None:
-        self._call(self._handle_pointer, voltage, steps)
+        with watched() as raised:
+            self._call(self._handle_pointer, voltage, steps)
+        if raised.said:
+            raise self.effects.failed(raised.said, self.states[S_TIME_STEPS] * self.dt)
         self.check()
 
     def check(self) -> None:

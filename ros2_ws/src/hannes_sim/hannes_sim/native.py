@@ -25,6 +25,15 @@ ADVANCE_SIGNATURE = types.void(types.CPointer(types.int64), types.float64, types
 """advance(handle, voltage, steps)"""
 
 
+def needs_python(function: Any) -> bool:
+    """Whether a numba cfunc calls what needs the interpreter, such as print.
+
+    It fails there and keeps the interpreter's lock, so that the process stands still.  Of one that came from numba's
+    cache this is not known (False).
+    """
+    return function.cache_hits == 0 and "missing Environment" in function.inspect_llvm()
+
+
 def _call(result: Any, arguments: tuple[Any, ...]) -> Any:
     """An intrinsic that calls the C function at an int64 address with arguments of the given numba types."""
 

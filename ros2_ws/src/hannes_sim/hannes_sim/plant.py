@@ -84,7 +84,7 @@ class Plant(Protocol):
         """Back to the open hand at rest; clears every state, so that a run repeats bit for bit."""
 
     def advance(self, voltage: float, steps: int) -> None:
-        """Hold the voltage [V] for `steps` steps of dt; raises PlantDiverged."""
+        """Hold the voltage [V] for `steps` steps of dt; raises PlantDiverged, HannesError where an effect raises."""
 
     def read(self) -> Reading:
         """The sensors now."""

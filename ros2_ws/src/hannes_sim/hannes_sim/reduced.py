@@ -83,6 +83,7 @@ from .ports import (
     TORQUE,
     VL,
 )  # fmt: skip
+from .raised import watched
 
 # Parameters of this plant, after the common ones
 (
@@ -328,7 +329,10 @@ class ReducedPlant:
         self.reading[R_JOINTS + N_JOINTS :] = rate * _CLOSED
 
     def advance(self, voltage: float, steps: int) -> None:
-        self._call(self._handle_pointer, voltage, steps)
+        with watched() as raised:
+            self._call(self._handle_pointer, voltage, steps)
+        if raised.said:
+            raise self.effects.failed(raised.said, self.states[S_TIME_STEPS] * self.dt)
         self.check()
         self._joints()
 

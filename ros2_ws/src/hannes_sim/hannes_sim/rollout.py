@@ -20,6 +20,7 @@ from hannes_description.errors import HannesError
 from numba import cfunc, njit
 from numpy.typing import NDArray
 
+from .effect import BoundEffects
 from .native import CONTROL_SIGNATURE, call_advance, call_control
 from .plant import DEFAULT_DT, Plant
 from .ports import (
@@ -34,6 +35,7 @@ from .ports import (
     R_VELOCITY,
     R_WARNING,
 )
+from .raised import Raised, watched
 
 Array = NDArray[np.float64]
 
@@ -49,8 +51,14 @@ class Controller(Protocol):
     def reset(self) -> None: ...
 
 
+_BY_PLANT = 2
+"""Flag of an exception that the plant raised, and not the control law."""
+
+
 @njit(cache=True, nogil=True)
-def _closed_loop(advance, handle, reading, control, cx, cp, cs, reference, period, substeps, out, voltages):  # type: ignore[no-untyped-def]
+def _closed_loop(  # type: ignore[no-untyped-def]
+    advance, handle, reading, control, cx, cp, cs, reference, period, substeps, out, voltages, raised
+):
     cx_at, cp_at, cs_at, handle_at = cx.ctypes.data, cp.ctypes.data, cs.ctypes.data, handle.ctypes.data
     n = reference.shape[0]
     for k in range(n):
@@ -61,12 +69,17 @@ def _closed_loop(advance, handle, reading, control, cx, cp, cs, reference, perio
         cx[C_PERIOD] = period
         cx[C_TIME] = k * period
         voltage = call_control(control, cx_at, cp_at, cs_at)
+        if raised[0] != 0:
+            return k
         for j in range(out.shape[1]):
             out[k, j] = reading[j]
         voltages[k] = voltage
         if reading[R_WARNING] != 0.0 or not math.isfinite(voltage):
             return k
         call_advance(advance, handle_at, voltage, substeps)
+        if raised[0] != 0:
+            raised[0] = _BY_PLANT
+            return k
     return n
 
 
@@ -180,7 +193,8 @@ def rollout(
 
     Each tick: read, control, log, advance (the order of the lock-step node graph, which gives the same trajectory).
     reset=False goes on from the present state; joints=False leaves the finger joints out of the log, which is faster.
-    Raises PlantDiverged where the simulation does; HannesError for a reference that is not finite.
+    Raises PlantDiverged where the simulation does; HannesError for a reference that is not finite, and where the
+    law or an effect raises an exception.
     """
     reference = np.ascontiguousarray(reference, dtype=np.float64)
     if reference.ndim != 1 or reference.size == 0:
@@ -195,20 +209,24 @@ def rollout(
     n = reference.size
     out = np.empty((n, N_READING if joints else R_JOINTS))
     voltages = np.empty(n)
-    done = _closed_loop(
-        plant.address,
-        plant.handle,
-        plant.reading,
-        controller.address,
-        np.zeros(N_CONTROL_INPUTS),
-        controller.parameters,
-        controller.states,
-        reference,
-        controller.period,
-        substeps,
-        out,
-        voltages,
-    )
+    with watched() as raised:
+        done = _closed_loop(
+            plant.address,
+            plant.handle,
+            plant.reading,
+            controller.address,
+            np.zeros(N_CONTROL_INPUTS),
+            controller.parameters,
+            controller.states,
+            reference,
+            controller.period,
+            substeps,
+            out,
+            voltages,
+            raised.flag,
+        )
+    if raised.said:
+        raise _failed(plant, raised, done * controller.period)
     plant.check()
     if done < n:
         raise HannesError(
@@ -216,3 +234,13 @@ def rollout(
             "check its gains."
         )
     return Rollout(out[:, R_TIME].copy(), reference, voltages, out)
+
+
+def _failed(plant: Plant, raised: Raised, time: float) -> HannesError:
+    """The error of whichever raised an exception at a time [s]."""
+    if raised.flag[0] != _BY_PLANT:
+        return HannesError(f"The control law failed at t = {time:.4g} s: {raised.said}.")
+    effects = getattr(plant, "effects", None)
+    if isinstance(effects, BoundEffects) and effects.effects:
+        return effects.failed(raised.said, plant.reading[R_TIME])
+    return HannesError(f"The plant failed at t = {time:.4g} s: {raised.said}.")

@@ -22,7 +22,6 @@ from rclpy.node import Node
 
 from .factory import make_plant
 from .objects import GraspObject, named_object
-from .plant import PlantDiverged
 from .rollout import substeps_of
 
 _CHECK_S = 0.02
@@ -172,10 +171,10 @@ class HandSim(HannesNode, Node):
         self._health.cycles += 1
 
     def _advance(self, voltage: float, periods: int) -> bool:
-        """Whether the plant went on; the node ends if it diverged or is at its end."""
+        """Whether the plant went on; the node ends if it failed or is at its end."""
         try:
             self._plant.advance(voltage, periods * self._substeps)
-        except PlantDiverged as error:
+        except HannesError as error:
             self.fail(error)
             return False
         self._tick += periods
