@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hannes_description.model import Model
+from hannes_lab.own_law import check_own_law
 from hannes_lab.rig import load_rig
 from hannes_sim.factory import make_plant
 from hannes_sim.plant import DEFAULT_DT
@@ -298,8 +299,17 @@ class Law:
         self.parameters, self.states = {parameters}, np.zeros(1)
 
     def reset(self):
-        pass
+        {reset}
 """
+
+
+GIVEN = {
+    "body": "pass",
+    "address": "COMPILED.address",
+    "period": "period",
+    "parameters": "np.zeros(1)",
+    "reset": "pass",
+}
 
 
 @pytest.mark.parametrize(
@@ -313,14 +323,34 @@ class Law:
         ({"period": "0.002"}, "its period is 0.002 s, that of the trial 0.001 s"),
         ({"parameters": "parameters['gain']"}, "Unknown parameter 'gain'"),
         ({"parameters": "parameters.gain"}, "AttributeError"),
+        (
+            {"body": "return p[3]"},
+            "reads p[3]: index 3 is out of bounds, the length of its `parameters` is 1",
+        ),
+        ({"body": "return s[-1]"}, "reads s[-1]: index -1 is out of bounds"),
+        ({"body": "s[2] += 2.0"}, "writes s[2]: index 2 is out of bounds, the length of its `states` is 1"),
+        ({"body": "x[6] = 2.0"}, "writes x[6]: index 6 is out of bounds, the length of x is 6"),
+        ({"body": "return 1.0 / p[0]"}, "The control law failed at t = 0 s: ZeroDivisionError"),
+        ({"body": "if x[5] > 0.3: raise ValueError('far')"}, "failed at t = 0.301 s: ValueError: far ("),
+        ({"reset": "self.start = self.gain"}, "Law.reset failed: AttributeError"),
+        ({"body": "print(x[0])"}, "calls print, or something else that needs Python"),
     ],
 )
 def test_a_control_law_that_cannot_run_is_refused(lab: Lab, change: dict[str, str], said: str) -> None:
-    """Address 0 would end the process without a word."""
-    given = {"body": "pass", "address": "COMPILED.address", "period": "period", "parameters": "np.zeros(1)"}
-    (lab.here / "law.py").write_text(LAW.format(**{**given, **change}))
+    """Address 0 would end the process without a word, and beside an array is whatever lies there."""
+    (lab.here / "law.py").write_text(LAW.format(**{**GIVEN, **change}))
     with_model(lab, (lab.folder / "mass.yaml").read_text().replace(BASE.rpartition(":")[0], "law.py"))
     assert said in lab.refused()
+
+
+def test_a_control_law_that_does_not_end_is_refused(lab: Lab) -> None:
+    body = "while x[4] > 0.0:\n        s[0] += 1.0"
+    (lab.here / "law.py").write_text(LAW.format(**{**GIVEN, "body": body}))
+    with_model(lab, (lab.folder / "mass.yaml").read_text().replace(BASE.rpartition(":")[0], "law.py"))
+    kind = load_rig(BASE)
+    rig = kind(kind.read([lab.folder / "mass.npz"]))
+    with pytest.raises(ValueError, match=r"law.py:Law' did not finish one closure within 1 s"):
+        check_own_law(rig, Model.load(lab.model), limit=1.0)
 
 
 def test_a_model_that_lacks_what_its_plant_needs_is_refused(lab: Lab) -> None:

@@ -35,7 +35,7 @@ from .diagnosis import Diagnosis
 from .executor import Executor, interruptible
 from .experiments import VISIBLE, Experiment
 from .falls import NO_REPEATS, errors_in_units
-from .own_effect import check_own_effects
+from .own_effect import check_own_effects, first_closure
 from .prepare import Prepared, load_trials, prepare, read_trials
 from .rig import load_rig
 from .trials import SIGNALS as COMPARED
@@ -232,8 +232,7 @@ def _executor(jobs: int, dask: str | None, no_cache: bool) -> Executor:
 
 def _check_effects(prepared: Prepared, sources: Sequence[str]) -> None:
     """Try the user's own effects on the shortest closure before working with them."""
-    trial = min(prepared.features.trials, key=lambda t: t.closures[0].stop)
-    reference = trial.reference[: round(trial.closures[0].stop / trial.period)]
+    trial, reference = first_closure(prepared.features.trials)
 
     def simulate(source: str) -> None:
         kind = prepared.rig.effect(load_effect(source))

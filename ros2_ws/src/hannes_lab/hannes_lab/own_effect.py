@@ -7,7 +7,7 @@ imported, compiled and simulated once with its typical values where a time limit
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -15,6 +15,8 @@ from hannes_description.errors import HannesError
 from hannes_sim.effect import ContributeFailed, EffectType, compile_effect, load_effect
 from hannes_sim.ports import DT, N_INPUTS, N_OUTPUTS, QL, VL, Q, T, V
 from numpy.typing import NDArray
+
+from .trials import Trial
 
 Array = NDArray[np.float64]
 
@@ -38,16 +40,38 @@ def check_own_effects(
             _check(source, simulate, motion, limit)
 
 
+def first_closure(trials: Sequence[Trial]) -> tuple[Trial, Array]:
+    """The trial whose first closure ends soonest, and its reference up to there."""
+    trial = min(trials, key=lambda t: t.closures[0].stop)
+    return trial, trial.reference[: round(trial.closures[0].stop / trial.period)]
+
+
 def _check(source: str, simulate: Simulate, motion: tuple[Array, Array], limit: float) -> None:
+    said = apart(
+        lambda: _try(source, simulate, motion),
+        ended=f"'{source}' ended the process that tried it: its contribute(x, p, s, y) writes outside its arrays.",
+        endless=f"'{source}' did not finish one closure within {limit:.0f} s: the file or its contribute(x, p, s, y) "
+        "has a loop that does not end.",
+        limit=limit,
+    )
+    if said:
+        raise HannesError(said)
+
+
+def apart(work: Callable[[], str], *, ended: str, endless: str, limit: float) -> str:
+    """What `work` says in a process of its own: `ended` if that ends, `endless` if it takes longer than `limit` s.
+
+    What `work` refuses with a HannesError is what it says.
+    """
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
-    process = context.Process(target=_try, args=(source, simulate, motion, there), daemon=True)
+    process = context.Process(target=_answer, args=(work, there), daemon=True)
     process.start()
     there.close()
     try:
-        answer = here.recv() if here.poll(limit) else None
+        return str(here.recv()) if here.poll(limit) else endless
     except EOFError:
-        answer = f"'{source}' ended the process that tried it: its contribute(x, p, s, y) writes outside its arrays."
+        return ended
     finally:
         if process.is_alive():
             process.join(1.0)
@@ -55,32 +79,29 @@ def _check(source: str, simulate: Simulate, motion: tuple[Array, Array], limit: 
             process.kill()
         process.join()
         here.close()
-    if answer is None:
-        raise HannesError(
-            f"'{source}' did not finish one closure within {limit:.0f} s: the file or its contribute(x, p, s, y) has a "
-            "loop that does not end."
-        )
-    if answer:
-        raise HannesError(answer)
 
 
-def _try(source: str, simulate: Simulate, motion: tuple[Array, Array], answer: Connection) -> None:
-    said = ""
+def _answer(work: Callable[[], str], there: Connection) -> None:
     try:
-        kind = load_effect(source)
-        compile_effect(kind)  # type: ignore[arg-type]  # a class is hashable
-        with np.errstate(all="ignore"):
-            said = _without_number(kind, source, *motion)
+        said = work()
     except HannesError as error:
         said = str(error)
+    there.send(said)
+    there.close()
+
+
+def _try(source: str, simulate: Simulate, motion: tuple[Array, Array]) -> str:
+    kind = load_effect(source)
+    compile_effect(kind)  # type: ignore[arg-type]  # a class is hashable
+    with np.errstate(all="ignore"):
+        said = _without_number(kind, source, *motion)
     if not said:
         try:
             simulate(source)
         except HannesError as error:
             strong = "" if isinstance(error, ContributeFailed) else " Is the typical value too strong?"
             said = f"'{source}' with its typical values: {error}{strong}"
-    answer.send(said)
-    answer.close()
+    return said
 
 
 def _acts_switched_off(kind: EffectType, x: Array) -> bool:

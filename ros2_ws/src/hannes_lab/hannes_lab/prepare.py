@@ -23,6 +23,7 @@ from .grasp import with_seen_objects
 from .hand import HandRig
 from .join import Loaded, join_repeats, join_trials
 from .lags import with_one_clock
+from .own_law import check_own_law
 from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig, check_parameters
 from .settle import settle
@@ -216,6 +217,8 @@ def prepare(
     check_parameters(rig, model)
     strange = not isinstance(rig, HandRig)
     told = check_rig(rig, model) if strange else []
+    if isinstance(rig, PlantRig):
+        check_own_law(rig, model)
     known = dict.fromkeys((*SIGNALS, "motor_effort", *(s for t in trials for s in t.signals)))
     present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
     unknown = [s for s in signals or () if s not in present]
