@@ -7,14 +7,20 @@ file would leave stale code in others; and an installed package may be read-only
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import sys
 import tempfile
+from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 _OURS = "HANNES_NUMBA_CACHE_DIR"
 """Environment variable that tells a child process that NUMBA_CACHE_DIR is ours, not the user's."""
+
+_log = logging.getLogger(__name__)
 
 
 def use_source_keyed_cache() -> Path | None:
@@ -40,3 +46,36 @@ def use_source_keyed_cache() -> Path | None:
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = str(folder)
     return folder
+
+
+@cache
+def forgive_damage() -> None:
+    """Let numba compile anew what a damaged file of its cache holds, and go on where the cache cannot be written.
+
+    A power cut leaves files that are empty or junk; numba's own reading of them ends in an exception.
+    """
+    from numba.core.caching import Cache
+
+    load, save = Cache.load_overload, Cache.save_overload
+
+    def load_overload(self: Any, *what: Any) -> Any:
+        try:
+            return load(self, *what)
+        except Exception as error:  # whatever unpickling junk raises
+            _log.debug("compiled anew: %s of %s", error, self.cache_path)
+            with suppress(OSError):
+                self.flush()  # an index that is junk would stop the saving too
+            return None
+
+    def save_overload(self: Any, *what: Any) -> None:
+        try:
+            save(self, *what)
+        except OSError as error:
+            _say_once(Path(self.cache_path).parent, error.strerror or type(error).__name__)
+
+    Cache.load_overload, Cache.save_overload = load_overload, save_overload
+
+
+@cache
+def _say_once(folder: Path, why: str) -> None:
+    _log.warning("hannes: compiled code is not kept, the folder %s cannot be used: %s", folder, why)

@@ -13,6 +13,10 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from ._compile_cache import forgive_damage
+
+forgive_damage()
+
 _DOUBLE_P = types.CPointer(types.float64)
 
 EFFECT_SIGNATURE = types.void(_DOUBLE_P, _DOUBLE_P, _DOUBLE_P, _DOUBLE_P)
