@@ -12,14 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from hannes_description.model import Model
 from hannes_sim.objects import GraspObject
 from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from .hand import HandRig, sensors_of
 from .surrogate import FAST_PLANT
@@ -215,7 +214,7 @@ def _felt(trial: Trial, model: Model) -> tuple[float, float] | None:
         return None
     phase = _phase(trial)
     position = trial.mean_closure("encoder_position", phase)
-    force = savgol_filter(trial.mean_closure("grip_force", phase), _window(phase, _span(trial)), 1)
+    force = _savgol(trial.mean_closure("grip_force", phase), _window(phase, _span(trial)), 1)
     top = int(np.argmax(position))
     still = position[: top + 1] < TOUCHES * position[top]
     if still.sum() < 4:
@@ -242,12 +241,18 @@ def _still(time: Array, position: Array, current: Array, span: float, model: Mod
     """
     value = model.parameters.value
     step, window = float(time[1] - time[0]), _window(time, span)
-    velocity, acceleration = (savgol_filter(position, window, 3, deriv=k, delta=step) for k in (1, 2))
+    velocity, acceleration = (_savgol(position, window, 3, deriv=k, delta=step) for k in (1, 2))
     inertia = value("motor.armature") * value("gear.ratio") ** 2 + value("hand.inertia")
     torque = inertia * acceleration + value("friction.viscous") * velocity
     if not braked:
         torque = np.maximum(torque, 0.0)
-    return np.asarray(savgol_filter(current, window, 3) - torque / _nominal(model)[2])
+    return np.asarray(_savgol(current, window, 3) - torque / _nominal(model)[2])
+
+
+def _savgol(values: Array, window: int, order: int, **options: Any) -> Array:
+    from scipy.signal import savgol_filter  # a third of the time in which the lab is imported
+
+    return np.asarray(savgol_filter(values, window, order, **options))
 
 
 def _advancing(position: Array, *currents: Array) -> Curve:
