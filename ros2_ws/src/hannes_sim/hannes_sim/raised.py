@@ -47,6 +47,7 @@ class _Watching(threading.local):
 
 _watching = _Watching()
 _before: Callable[[Any], Any] = sys.__unraisablehook__
+_setting = threading.Lock()
 
 
 def _hook(unraisable: Any) -> None:
@@ -62,7 +63,10 @@ def watched() -> Iterator[Raised]:
     """Keep what compiled code raises in this thread meanwhile."""
     global _before
     if sys.unraisablehook is not _hook:
-        _before, sys.unraisablehook = sys.unraisablehook, _hook
+        with _setting:
+            # of two threads that come here one sets it, or the hook before it would be the hook itself
+            if sys.unraisablehook is not _hook:
+                _before, sys.unraisablehook = sys.unraisablehook, _hook
     outer, raised = _watching.raised, Raised()
     _watching.raised = raised
     try:
