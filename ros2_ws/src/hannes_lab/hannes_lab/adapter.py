@@ -100,7 +100,7 @@ def _check_drive(rig: PlantRig, who: str) -> None:
     recorded = dict.fromkeys(s for trial in rig.trials for s in trial.signals)
     for name in names:
         near = get_close_matches(name, recorded, 1, 0.8)
-        if near and name not in (*SIGNALS, "motor_effort", *recorded):
+        if near and name not in (*SIGNALS, *recorded):
             raise HannesError(
                 f"{who}.drive_signals names '{name}', which is no signal of the recordings; they have "
                 f"{', '.join(recorded)}: is '{near[0]}' meant?"

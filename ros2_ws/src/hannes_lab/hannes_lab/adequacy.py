@@ -81,9 +81,7 @@ def implausible(candidate: Candidate) -> str:
 
 
 def exaggerated(search: Search, candidate: Candidate) -> str:
-    """The effect that is stronger than EXTREME in recordings of another machine than the simulator's, in words; or
-    empty.
-    """
+    """The effect that is stronger than EXTREME where the model has an error of its own, in words; or empty."""
     if not search.problem.discrepancy:
         return ""
     for effect in candidate.names:

@@ -297,7 +297,7 @@ def compare(
     """Compare the model with recorded closures: where does it fail, and by how much?"""
     _check_files(report)
     prepared = _prepared(bags, model, objects, signals, rig, scale, _JOBS, topics)
-    with _Progress(quiet=json or not fitted) as progress, _executor(_JOBS, None, no_cache=False) as executor:
+    with _Progress(quiet=json or not fitted) as progress, _executor(_JOBS, None, not fitted) as executor:
         result = compare_model(prepared, fitted=fitted, executor=executor, progress=progress)
     try:
         if json:
