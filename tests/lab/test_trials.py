@@ -249,6 +249,12 @@ def test_a_slow_log_of_the_reference_is_filled_smoothly(rate: float) -> None:
     assert np.sqrt((error**2).mean()) < 0.5 * np.sqrt((linear**2).mean())
 
 
+def test_a_rate_is_told_right_where_stamps_are_whole_milliseconds() -> None:
+    at = np.round(np.arange(0.0, 3.0, 1.0 / 60.0), 3)
+    note = reference_on_grid(at, np.sin(at), 1e-3, 2.9)[1]
+    assert note is not None and "logged at 60 Hz" in note
+
+
 @pytest.mark.parametrize("rate", [50.0, 200.0])
 def test_of_messages_of_one_instant_the_last_holds(rate: float) -> None:
     """A recorder that stamps what it receives may give two messages that came together the same stamp."""

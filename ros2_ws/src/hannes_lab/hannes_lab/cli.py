@@ -326,6 +326,8 @@ def _show_comparison(result: Comparison) -> None:
             _number(c.ratio, 3),
             "fails" if c.fails else "",
         )
+    if any(c.fails for c in result.cells):
+        table.caption = "fails: the mean over the closures is further off than their scatter makes it"
     console.print(table)
     table = (
         Table(title="Figures of the thesis") if result.metrics else Table(show_header=False, show_edge=False)

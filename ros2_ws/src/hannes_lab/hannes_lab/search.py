@@ -550,9 +550,9 @@ class Search:
         done = {c.key for c, known in zip(fitted, best, strict=True) if c is not known}
         done |= {c.key for c in ended}
         ranked = sorted(best, key=lambda c: c.penalised)
-        # On a slow plant polishing is long, and the best are polished already.
-        most = min(worth, RIVAL_START * ranked[0].penalised) if self.slow and ranked else worth
-        worthy = [c for c in ranked[:POLISH] if c.penalised < most and c.key not in done]
+        worthy = [
+            c for c in ranked[:POLISH] if c.penalised < self._rivals(ranked, worth) and c.key not in done
+        ]
         ranked = self.polished(ranked, worthy, text)
         if not self.slow and ranked and (ranked[0].far_off or ranked[0].penalised >= worth):
             done |= {c.key for c in worthy}
@@ -560,6 +560,20 @@ class Search:
             bent = [c for c in rest if self._led_astray(todo[c.key][0])]
             ranked = self.polished(ranked, bent, text)
         return ranked
+
+    def _rivals(self, ranked: Sequence[Candidate], worth: float) -> float:
+        """Penalised cost below which one of the ranked extensions may come to rival the best by polishing.
+
+        On a slow plant polishing is long, and the best are polished already.  Where the best explains all without
+        taking a machine far off, what costs HOPELESS times as much can no longer tie with it.
+        """
+        if not ranked:
+            return worth
+        best = ranked[0]
+        if self.slow:
+            return min(worth, RIVAL_START * best.penalised)
+        whole = best.fit.cost <= self.problem.features.size and not best.far_off
+        return min(worth, HOPELESS * best.penalised) if whole else worth
 
     def _led_astray(self, base: Candidate) -> bool:
         """True where a base leaves little and is far off: what it takes over fits nearly as well as an effect would."""
