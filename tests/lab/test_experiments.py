@@ -52,15 +52,18 @@ def test_another_recording_tells_slack_from_a_glove(undescribed: Prepared) -> No
     assert distance_of_fits(undescribed, ["wire_slack", "glove_stiffness"]) > VISIBLE
 
 
-def tied(prepared: Prepared) -> tuple[Search, list[Candidate]]:
-    search = Search(prepared.problem, prepared.model, prepared.nuisances, effect_sources(only=["gravity"]))
+@pytest.fixture(scope="module")
+def tied(undescribed: Prepared) -> tuple[Search, list[Candidate]]:
+    """A search, and two of its sets that are taken to tie."""
+    found = undescribed
+    search = Search(found.problem, found.model, found.nuisances, effect_sources(only=["gravity"]))
     return search, [search.null(), search.add(search.null(), "gravity")]
 
 
 def test_what_diverges_in_one_condition_leaves_the_others(
-    undescribed: Prepared, monkeypatch: pytest.MonkeyPatch
+    undescribed: Prepared, tied: tuple[Search, list[Candidate]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    search, models = tied(undescribed)
+    search, models = tied
     assert any(e.name == "fast_soft" for e in separating_experiments(undescribed, search, models, keep=8))
     simulate = HandRig.simulate
 
@@ -74,8 +77,10 @@ def test_what_diverges_in_one_condition_leaves_the_others(
     assert len(left) == 7 and all(e.name != "fast_soft" for e in left)
 
 
-def test_a_signal_that_never_changes_tells_nothing_apart(undescribed: Prepared) -> None:
-    search, models = tied(undescribed)
+def test_a_signal_that_never_changes_tells_nothing_apart(
+    undescribed: Prepared, tied: tuple[Search, list[Candidate]]
+) -> None:
+    search, models = tied
     before = separating_experiments(undescribed, search, models)
     features = undescribed.features
     still = replace(features.blocks[0], signal="grip_force", measured=0.0 * features.blocks[0].measured)
