@@ -191,6 +191,42 @@ def test_hannes_motor_switches_a_running_controller(peer):
     assert wrong.stderr.count("\n") == 1 and "'/no name!' is no name of a node" in wrong.stderr
 
 
+def test_a_transition_that_the_state_does_not_allow_is_refused_and_the_node_lives(peer):
+    with processes(NodeProcess(NAME, clock="realtime", autostart=False)) as (node,):
+        for possible, number, state in (
+            (False, Transition.TRANSITION_ACTIVATE, "unconfigured"),
+            (False, 77, "unconfigured"),
+            (True, Transition.TRANSITION_CONFIGURE, "inactive"),
+            (False, Transition.TRANSITION_CONFIGURE, "inactive"),
+            (False, Transition.TRANSITION_DEACTIVATE, "inactive"),
+            (True, Transition.TRANSITION_ACTIVATE, "active"),
+            (False, Transition.TRANSITION_ACTIVATE, "active"),
+            (True, Transition.TRANSITION_ACTIVE_SHUTDOWN, "finalized"),
+            (False, Transition.TRANSITION_ACTIVATE, "finalized"),
+        ):
+            assert transition(peer, number) is possible
+            assert lifecycle(peer).state() == state
+        assert node.process.poll() is None
+        assert "Traceback" not in node.output
+
+
+class Hurried(Lifecycle):
+    """Somebody else makes each transition a moment before."""
+
+    def change(self, transition: int) -> bool:
+        assert super().change(transition)
+        return super().change(transition)
+
+
+def test_the_motor_is_switched_by_two_at_once(peer, monkeypatch):
+    monkeypatch.setattr(motor_switch, "Lifecycle", Hurried)
+    monkeypatch.setattr(motor_switch, "_PATIENCE_S", PATIENCE)
+    with processes(NodeProcess(NAME, clock="lockstep", autostart=False)):
+        name = f"{peer.node.get_namespace().rstrip('/')}/{NAME}"
+        assert motor_switch.switch(name, True, PATIENCE) == "active"
+        assert motor_switch.switch(name, False, PATIENCE) == "inactive"
+
+
 class Deaf:
     """A client whose first requests get no answer, as when Fast DDS drops one, and which counts them.
 

@@ -16,6 +16,7 @@ from hannes_ros.loop import RealtimeLoop
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from .double_pid import DoublePID
@@ -141,6 +142,19 @@ class MotorController(HannesNode, LifecycleNode):
             self.trigger_activate()
 
     # -- life cycle --------------------------------------------------------------------------------------------------
+    def _LifecycleNodeMixin__change_state(self, transition_id: int) -> TransitionCallbackReturn:
+        """rclpy's way into every transition: by the service and by `trigger_*`.
+
+        Where the state does not allow the transition rclpy raises, which would end the node; here it is a failure.
+        """
+        try:
+            return super()._LifecycleNodeMixin__change_state(transition_id)  # type: ignore[misc]
+        except rclpy_implementation.RCLError:
+            self.get_logger().warning(
+                f"transition {transition_id} is not possible in this state: nothing done"
+            )
+            return TransitionCallbackReturn.FAILURE
+
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Ready, motor off."""
         self._pid.reset()
