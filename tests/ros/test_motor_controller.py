@@ -7,7 +7,8 @@ import math
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
@@ -116,6 +117,81 @@ def test_wrong_joint_and_not_finite_inputs_are_rejected_and_counted(peer):
         assert voltages(peer)[2] > 0.0
         rejected = "motor/state is rejected: the joints are ['elbow'], expected ['motor_pulley']"
         peer.until(lambda: rejected in node.output, what="the reason in the log")
+
+
+def test_a_reference_that_is_not_finite_leaves_the_last_good_one(peer):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    law = DoublePID.of_model(Model.load("nominal").parameters)
+    with processes(NodeProcess(NAME, clock="lockstep")) as (node,):
+        announce(peer)
+        for tick, reference in enumerate((math.nan, 5.0, math.nan, math.inf)):
+            say_tick(peer, tick, 1.0, 0.5, reference)
+            peer.until(lambda tick=tick: len(voltages(peer)) == tick + 1, what=f"voltage {tick}")
+        assert voltages(peer) == [0.0, *(law.update(5.0, 1.0, 0.5) for _ in range(3))]
+        said = "reference_position is not finite (inf): the last good one holds"
+        bad = peer.until_status(NAME, lambda s: s["message"] == said, "the rejected reference")
+        assert (bad["level"], bad["rejected_inputs"]) == ("1", "3")
+        peer.until(lambda: "reference_position is not finite (" in node.output, what="the reason in the log")
+        say_tick(peer, 4, 1.0, 0.5, 6.0)
+        peer.until(lambda: len(voltages(peer)) == 5)
+        assert voltages(peer)[4] == law.update(6.0, 1.0, 0.5)
+        peer.until_status(NAME, lambda s: "not finite" not in s["message"] and s["level"] == "0", "all well")
+
+
+@dataclass
+class Sensors:
+    """State, current and reference in real time, as a board would send them; long limits, for a busy machine."""
+
+    peer: Peer
+    position: float = 1.0
+    current: float = 0.1
+    reference: float = 5.0
+    stamped_ahead: float = 0.0
+    patient = {"clock": "realtime", "pause_limit_ms": 10000, "state_timeout_ms": 3000}
+
+    def say(self) -> None:
+        now = self.peer.node.get_clock().now().nanoseconds + round(self.stamped_ahead * 1e9)
+        self.peer.say("encoder_position", state_bytes(now, self.position))
+        self.peer.say("motor_current", convert.float64_bytes(self.current))
+        self.peer.say("reference_position", convert.float64_bytes(self.reference))
+        self.peer.spin(0.002)
+
+    def until(self, condition: Callable[[Mapping[str, str]], bool], what: str) -> Mapping[str, str]:
+        """Send until the controller's status is that."""
+
+        def said() -> bool:
+            self.say()
+            return bool(self.peer.status(NAME)) and condition(self.peer.status(NAME))
+
+        self.peer.until(said, what=what)
+        return self.peer.status(NAME)
+
+
+@pytest.mark.parametrize(
+    ("bad", "said", "level"),
+    (
+        ({"current": math.nan}, "motor/current is not finite (nan): 0 V", "2"),
+        ({"position": math.nan}, "position of motor/state is not finite (nan): 0 V", "2"),
+        ({"reference": math.nan}, "reference_position is not finite (nan): the last good one holds", "1"),
+    ),
+)
+def test_inputs_that_are_not_finite_are_said_until_good_ones_come(peer, bad, said, level):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    sensors = Sensors(peer)
+    with processes(NodeProcess(NAME, **Sensors.patient)) as (node,):
+        announce(peer)
+        sensors.until(lambda s: s["message"].startswith("running"), "a driven motor")
+        for name, value in bad.items():
+            setattr(sensors, name, value)
+        status = sensors.until(lambda s: said in s["message"], "the rejected input")
+        assert status["level"] >= level
+        assert (voltages(peer)[-1] == 0.0) is (level == "2")
+        peer.until(lambda: said in node.output, what="the reason in the log")
+        sensors.position, sensors.current, sensors.reference = 1.0, 0.1, 5.0
+        sensors.until(lambda s: s["message"].startswith("running"), "all well again")
+        assert voltages(peer)[-1] > 0.0
 
 
 def test_the_motor_is_driven_only_while_active_and_activation_clears_the_integrator(peer):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass
 from time import monotonic
@@ -202,23 +203,51 @@ class MotorController(HannesNode, LifecycleNode):
         self._health.count("resets")
 
     # -- the law -----------------------------------------------------------------------------------------------------
-    def _command(self, reference: float, position: float, current: float) -> float:
-        """Voltage (V), clamped; what is not finite gives 0 V and a cleared controller."""
+    def _command(self, reference: float | None, position: float, current: float) -> float:
+        """Voltage (V), clamped; a sensor that is not finite gives 0 V and a cleared controller, no reference 0 V."""
+        if reference is None:
+            return 0.0
         try:
             voltage = self._pid.update(reference, position, current)
         except HannesError:
-            self._health.count("rejected_inputs")
             self._clear()
             return 0.0
         return min(max(voltage, -self._limit), self._limit)
 
     def _decode(self, data: bytes) -> convert.JointSample | None:
         try:
-            return convert.MOTOR_STATE.decode(data)
+            sample = convert.MOTOR_STATE.decode(data)
         except HannesError as error:
-            self._health.count("rejected_states")
-            self.get_logger().error(f"motor/state is rejected: {error}", throttle_duration_sec=5.0)
+            self._reject_state(ERROR, str(error))
             return None
+        self._finite("position of motor/state", sample.position[0], ERROR, "0 V")
+        return sample
+
+    def _reject_state(self, level: bytes, why: str) -> None:
+        self._health.count("rejected_states")
+        self._health.faults.bad("motor/state", level, f"motor/state is rejected: {why}")
+
+    def _decode_current(self, data: bytes) -> float:
+        current = convert.float64_value(data)
+        self._finite("motor/current", current, ERROR, "0 V")
+        return current
+
+    def _decode_reference(self, data: bytes) -> float | None:
+        """The reference (rad) from here on: one that is not finite leaves the last good one, None if there was none."""
+        value = convert.float64_value(data)
+        instead = "0 V" if self._reference is None else "the last good one holds"
+        if self._finite("reference_position", value, WARN, instead):
+            self._reference, self._reference_at = value, monotonic()
+        return self._reference
+
+    def _finite(self, name: str, value: float, level: bytes, instead: str) -> bool:
+        """Whether an input is finite; if not it is counted and reported, with what is done instead."""
+        if math.isfinite(value):
+            self._health.faults.good(name)
+            return True
+        self._health.count("rejected_inputs")
+        self._health.faults.bad(name, level, f"{name} is not finite ({value}): {instead}")
+        return False
 
     def _profile_at(self, tick: int) -> float:
         assert self._profile is not None and self._own_reference is not None
@@ -236,13 +265,14 @@ class MotorController(HannesNode, LifecycleNode):
         if backwards or age_ns > self._p.state_timeout_ms * 1e6:
             self._health.count("rejected_states")
             return
+        self._health.faults.good("motor/state")
         self._state, self._state_at = sample, monotonic()
 
     def _on_current(self, data: bytes) -> None:
-        self._current, self._current_at = convert.float64_value(data), monotonic()
+        self._current, self._current_at = self._decode_current(data), monotonic()
 
     def _on_reference(self, data: bytes) -> None:
-        self._reference, self._reference_at = convert.float64_value(data), monotonic()
+        self._decode_reference(data)
 
     def _step(self, now: float, elapsed: int) -> None:
         """One period of the real-time thread."""
@@ -263,9 +293,7 @@ class MotorController(HannesNode, LifecycleNode):
         else:
             self._stale = False
             reference = self._reference if self._profile is None else self._profile_at(self._start)
-            voltage = (
-                0.0 if reference is None else self._command(reference, self._state.position[0], self._current)
-            )
+            voltage = self._command(reference, self._state.position[0], self._current)
         self._voltage.publish(convert.float64_bytes(voltage))
         self._health.cycles += 1
 
@@ -274,9 +302,11 @@ class MotorController(HannesNode, LifecycleNode):
         sample = self._decode(data)
         if sample is None:
             return
+        self._health.faults.good("motor/state")
         if sample.stamp_ns < self._answered:  # the simulator began again
             self._join.reset()
             self._answered = self._heard = -1
+            self._reference = None
             self._clear()
         elif sample.stamp_ns == self._heard:  # repeated to a newcomer
             self._join.rejoin()
@@ -284,10 +314,10 @@ class MotorController(HannesNode, LifecycleNode):
         self._put(0, sample)
 
     def _on_tick_current(self, data: bytes) -> None:
-        self._put(1, convert.float64_value(data))
+        self._put(1, self._decode_current(data))
 
     def _on_tick_reference(self, data: bytes) -> None:
-        self._put(2, convert.float64_value(data))
+        self._put(2, self._decode_reference(data))
 
     def _put(self, slot: int, item: object) -> None:
         self._state_at = monotonic()
@@ -364,7 +394,7 @@ class MotorController(HannesNode, LifecycleNode):
                 (self._state, self._current, self._reference if self._profile is None else 0.0),
                 strict=True,
             )
-            if value is None
+            if value is None and name not in self._health.faults
         ]
         return (WARN, f"waiting for {', '.join(absent)}", values) if absent else (OK, "running", values)
 
