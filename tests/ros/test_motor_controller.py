@@ -18,6 +18,7 @@ from graph import NodeProcess, Peer, kept_waiting, processes
 from hannes_bringup import motor_switch
 from hannes_bringup.motor_switch import Lifecycle
 from hannes_control.double_pid import DoublePID
+from hannes_control.reference import half_sine
 from hannes_description.model import Model
 from hannes_ros import convert
 from lifecycle_msgs.msg import Transition
@@ -146,7 +147,7 @@ class Sensors:
     peer: Peer
     position: float = 1.0
     current: float = 0.1
-    reference: float = 5.0
+    reference: float | None = 5.0
     stamped_ahead: float = 0.0
     patient = {"clock": "realtime", "pause_limit_ms": 10000, "state_timeout_ms": 3000}
 
@@ -154,7 +155,8 @@ class Sensors:
         now = self.peer.node.get_clock().now().nanoseconds + round(self.stamped_ahead * 1e9)
         self.peer.say("encoder_position", state_bytes(now, self.position))
         self.peer.say("motor_current", convert.float64_bytes(self.current))
-        self.peer.say("reference_position", convert.float64_bytes(self.reference))
+        if self.reference is not None:
+            self.peer.say("reference_position", convert.float64_bytes(self.reference))
         self.peer.spin(0.002)
 
     def until(self, condition: Callable[[Mapping[str, str]], bool], what: str) -> Mapping[str, str]:
@@ -192,6 +194,40 @@ def test_inputs_that_are_not_finite_are_said_until_good_ones_come(peer, bad, sai
         sensors.position, sensors.current, sensors.reference = 1.0, 0.1, 5.0
         sensors.until(lambda s: s["message"].startswith("running"), "all well again")
         assert voltages(peer)[-1] > 0.0
+
+
+def test_a_profile_of_its_own_waits_for_the_hand(peer):
+    peer.hear("motor_voltage", "reference_position")
+    peer.hear_diagnostics()
+    sensors = Sensors(peer, reference=None)
+    profile = half_sine(period=400.0)  # 100 s of closing: it tells which period a reference is of
+
+    def references() -> list[float]:
+        return [convert.float64_value(data) for data in peer.heard["reference_position"]]
+
+    def next_report() -> Mapping[str, str]:
+        before = len(peer.diagnostics)
+        peer.until(lambda: len(peer.diagnostics) > before, what="the next report")
+        return peer.status(NAME)
+
+    with processes(NodeProcess(NAME, reference="half_sine", reference_period=400.0, **Sensors.patient)):
+        for name in ("encoder_position", "motor_current"):
+            peer.matched(name)
+        next_report()
+        next_report()  # a second of waiting
+        assert references() == []
+        sensors.until(lambda s: s["message"].startswith("running"), "a driven motor")
+        assert references()[0] == profile[0]
+        peer.until_status(NAME, lambda s: int(s["state_timeouts"]) > 0, "the timeout")
+        stands = len(references())
+        next_report()
+        next_report()  # a second without sensors
+        sensors.until(lambda s: s["message"].startswith("running"), "a driven motor again")
+        given = references()
+        assert len(given) > stands
+        # one period for each reference, besides those that a busy machine made the loop miss
+        missed = int(next_report()["missed_cycles"])
+        assert np.searchsorted(profile[:100_000], given[-1]) < len(given) + missed
 
 
 def test_the_motor_is_driven_only_while_active_and_activation_clears_the_integrator(peer):

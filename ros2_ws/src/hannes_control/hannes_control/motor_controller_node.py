@@ -38,7 +38,9 @@ class MotorControllerParameters:
         True, "configure and activate at start; otherwise wait for the lifecycle services"
     )
     reference: str = parameter(
-        "topic", "topic, or a profile of its own from the activation on", choices=("topic", *PROFILES)
+        "topic",
+        "topic, or a profile of its own from the first state and current after the activation on",
+        choices=("topic", *PROFILES),
     )
     reference_closures: int = parameter(1, "closures of the profile", lower=1, upper=100000)
     reference_amplitude: float = parameter(
@@ -107,7 +109,7 @@ class MotorController(HannesNode, LifecycleNode):
         self._reference: float | None = None
         self._state_at = self._current_at = self._reference_at = 0.0
         self._stale = False
-        self._start = 0
+        self._played = -1
         self._answered = self._heard = -1
         self._period_ns = round(p.period * 1e9)
         self._join = TickJoin(2 if self._profile is not None else 3)
@@ -169,7 +171,7 @@ class MotorController(HannesNode, LifecycleNode):
             if self._join.synchronised:
                 self._answer()
         else:
-            self._start = -1
+            self._played = -1
             self._loop = RealtimeLoop(self._p.period, self._step)
             self._loop.start()
         return TransitionCallbackReturn.SUCCESS
@@ -276,7 +278,6 @@ class MotorController(HannesNode, LifecycleNode):
 
     def _step(self, now: float, elapsed: int) -> None:
         """One period of the real-time thread."""
-        self._start += elapsed
         if not self._active or self._tripped:
             return
         if elapsed * self._p.period * 1e3 > self._p.pause_limit_ms:
@@ -292,7 +293,9 @@ class MotorController(HannesNode, LifecycleNode):
             voltage = 0.0
         else:
             self._stale = False
-            reference = self._reference if self._profile is None else self._profile_at(self._start)
+            # a profile begins with the first period that has live sensors, and stands while they are stale
+            self._played += elapsed if self._played >= 0 else 1
+            reference = self._reference if self._profile is None else self._profile_at(self._played)
             voltage = self._command(reference, self._state.position[0], self._current)
         self._voltage.publish(convert.float64_bytes(voltage))
         self._health.cycles += 1
