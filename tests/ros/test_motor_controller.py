@@ -196,6 +196,42 @@ def test_inputs_that_are_not_finite_are_said_until_good_ones_come(peer, bad, sai
         assert voltages(peer)[-1] > 0.0
 
 
+@pytest.mark.parametrize(("ahead", "said"), ((-60.0, " s before "), (60.0, " s after ")))
+def test_states_of_another_clock_are_rejected_and_said(peer, ahead, said):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    sensors = Sensors(peer, stamped_ahead=ahead)
+    with processes(NodeProcess(NAME, **Sensors.patient)) as (node,):
+        announce(peer)
+        status = sensors.until(lambda s: "motor/state is rejected" in s["message"], "the reason")
+        assert said + "the clock of this machine (for a played bag set use_sim_time)" in status["message"]
+        assert "waiting for motor/state" not in status["message"]
+        assert status["level"] == "2"
+        assert voltages(peer) == []
+        peer.until(
+            lambda: "motor/state is rejected: it is stamped" in node.output, what="the reason in the log"
+        )
+        sensors.stamped_ahead = 0.0
+        before = int(
+            sensors.until(lambda s: s["message"].startswith("running"), "a motor")["rejected_states"]
+        )
+        # a single one costs no other: those that follow it are not older than it
+        sensors.stamped_ahead = ahead
+        sensors.say()
+        sensors.stamped_ahead = 0.0
+        status = sensors.until(lambda s: int(s["rejected_states"]) > before, "one more rejected")
+        assert (int(status["rejected_states"]), status["state_timeouts"]) == (before + 1, "0")
+
+
+def test_states_without_a_stamp_are_rejected_and_said(peer):
+    peer.hear_diagnostics()
+    with processes(NodeProcess(NAME, **Sensors.patient)):
+        announce(peer)
+        peer.say("encoder_position", state_bytes(0, 1.0))
+        said = "motor/state is rejected: no stamp by the clock of this machine"
+        peer.until_status(NAME, lambda s: said in s["message"], "the reason")
+
+
 def test_a_profile_of_its_own_waits_for_the_hand(peer):
     peer.hear("motor_voltage", "reference_position")
     peer.hear_diagnostics()

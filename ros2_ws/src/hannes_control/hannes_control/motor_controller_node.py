@@ -262,13 +262,28 @@ class MotorController(HannesNode, LifecycleNode):
         sample = self._decode(data)
         if sample is None:
             return
-        age_ns = self.get_clock().now().nanoseconds - sample.stamp_ns
-        backwards = self._state is not None and sample.stamp_ns <= self._state.stamp_ns and not self._stale
-        if backwards or age_ns > self._p.state_timeout_ms * 1e6:
-            self._health.count("rejected_states")
+        age = (self.get_clock().now().nanoseconds - sample.stamp_ns) * 1e-9
+        if abs(age) > self._p.state_timeout_ms / 1e3:
+            self._reject_state(ERROR, self._wrong_stamp(sample.stamp_ns, age))
+            return
+        if self._state is not None and sample.stamp_ns <= self._state.stamp_ns and not self._stale:
+            self._reject_state(WARN, "its stamp is not later than the one before")
             return
         self._health.faults.good("motor/state")
         self._state, self._state_at = sample, monotonic()
+
+    def _wrong_stamp(self, stamp_ns: int, age: float) -> str:
+        """What is wrong with a stamp that is `age` s old, or ahead where that is negative."""
+        if self.get_clock().ros_time_is_active:
+            clock = "/clock (use_sim_time)"
+        else:
+            clock = "the clock of this machine (for a played bag set use_sim_time)"
+        off = (
+            f"it is stamped {abs(age):.3g} s {'before' if age > 0.0 else 'after'}"
+            if stamp_ns
+            else "no stamp by"
+        )
+        return f"{off} {clock}; {self._p.state_timeout_ms / 1e3:g} s are allowed"
 
     def _on_current(self, data: bytes) -> None:
         self._current, self._current_at = self._decode_current(data), monotonic()
