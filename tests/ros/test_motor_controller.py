@@ -140,6 +140,25 @@ def test_a_reference_that_is_not_finite_leaves_the_last_good_one(peer):
         peer.until_status(NAME, lambda s: "not finite" not in s["message"] and s["level"] == "0", "all well")
 
 
+def test_a_reference_beyond_the_travel_of_the_hand_is_limited(peer):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    law = DoublePID.of_model(Model.load("nominal").parameters)
+    close_to = 15.6 + 1e-6  # rounding is no reason to say a word
+    with processes(NodeProcess(NAME, clock="lockstep")) as (node,):
+        announce(peer)
+        for tick, reference in enumerate((close_to, -60.0, 400.0)):
+            say_tick(peer, tick, 14.0, 0.5, reference)
+            peer.until(lambda tick=tick: len(voltages(peer)) == tick + 1, what=f"voltage {tick}")
+        assert voltages(peer) == [law.update(reference, 14.0, 0.5) for reference in (close_to, 0.0, 15.6)]
+        said = "reference_position of 400 rad is limited to 0 .. 15.6 rad, the travel of the hand"
+        status = peer.until_status(NAME, lambda s: s["message"] == said, "the limited reference")
+        assert (status["level"], status["limited_references"]) == ("1", "2")
+        peer.until(lambda: "is limited to 0 .. 15.6 rad" in node.output, what="the reason in the log")
+        say_tick(peer, 3, 14.0, 0.5, 14.0)
+        peer.until_status(NAME, lambda s: "limited to" not in s["message"] and s["level"] == "0", "all well")
+
+
 @dataclass
 class Sensors:
     """State, current and reference in real time, as a board would send them; long limits, for a busy machine."""
@@ -176,9 +195,10 @@ class Sensors:
         ({"current": math.nan}, "motor/current is not finite (nan): 0 V", "2"),
         ({"position": math.nan}, "position of motor/state is not finite (nan): 0 V", "2"),
         ({"reference": math.nan}, "reference_position is not finite (nan): the last good one holds", "1"),
+        ({"reference": 400.0}, "reference_position of 400 rad is limited to 0 .. 15.6 rad", "1"),
     ),
 )
-def test_inputs_that_are_not_finite_are_said_until_good_ones_come(peer, bad, said, level):
+def test_bad_inputs_are_said_until_good_ones_come(peer, bad, said, level):
     peer.hear("motor_voltage")
     peer.hear_diagnostics()
     sensors = Sensors(peer)

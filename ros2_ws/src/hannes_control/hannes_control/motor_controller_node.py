@@ -9,6 +9,7 @@ from time import monotonic
 
 import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 from hannes_description.errors import HannesError
+from hannes_description.joints import RAD_PER_COUNT
 from hannes_description.model import Model
 from hannes_ros import convert, topics
 from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
@@ -21,7 +22,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from .double_pid import DoublePID
-from .reference import FULL_CLOSURE, PROFILES, Profile, check_travel, make_profile
+from .reference import FULL_CLOSURE, PROFILES, Profile, check_travel, make_profile, travel_of
 
 _CHECK_S = 0.02
 _ZERO = convert.float64_bytes(0.0)
@@ -101,9 +102,12 @@ class MotorController(HannesNode, LifecycleNode):
         self._profile = p.profile()
         if self._profile is not None:
             check_travel(p.reference_amplitude, model.parameters)
+        self._travel = travel_of(model.parameters)
         self._lockstep = p.clock == "lockstep"
         self._active = self._tripped = False
-        self._health = Health("rejected_states", "rejected_inputs", "state_timeouts", "trips", "resets")
+        self._health = Health(
+            "rejected_states", "rejected_inputs", "limited_references", "state_timeouts", "trips", "resets"
+        )
         self._state: convert.JointSample | None = None
         self._current: float | None = None
         self._reference: float | None = None
@@ -235,12 +239,28 @@ class MotorController(HannesNode, LifecycleNode):
         return current
 
     def _decode_reference(self, data: bytes) -> float | None:
-        """The reference (rad) from here on: one that is not finite leaves the last good one, None if there was none."""
+        """The reference (rad) from here on: within the hand's travel, beyond which the motor would stall or unwind.
+
+        One that is not finite leaves the last good one, None if there was none.
+        """
         value = convert.float64_value(data)
         instead = "0 V" if self._reference is None else "the last good one holds"
         if self._finite("reference_position", value, WARN, instead):
-            self._reference, self._reference_at = value, monotonic()
+            self._reference, self._reference_at = self._limited(value), monotonic()
         return self._reference
+
+    def _limited(self, reference: float) -> float:
+        limited = min(max(reference, 0.0), self._travel)
+        if abs(reference - limited) <= RAD_PER_COUNT:  # rounding
+            self._health.faults.good("travel")
+            return reference
+        self._health.count("limited_references")
+        self._health.faults.bad(
+            "travel",
+            WARN,
+            f"reference_position of {reference:g} rad is limited to 0 .. {self._travel:g} rad, the travel of the hand",
+        )
+        return limited
 
     def _finite(self, name: str, value: float, level: bytes, instead: str) -> bool:
         """Whether an input is finite; if not it is counted and reported, with what is done instead."""
