@@ -50,6 +50,13 @@ def voltages(peer: Peer) -> list[float]:
     return [convert.float64_value(data) for data in peer.heard["motor_voltage"]]
 
 
+def next_report(peer: Peer) -> Mapping[str, str]:
+    """The next diagnostics, with the controller as the only node."""
+    before = len(peer.diagnostics)
+    peer.until(lambda: len(peer.diagnostics) > before, what="the next report")
+    return peer.status(NAME)
+
+
 def lifecycle(peer: Peer) -> Lifecycle:
     return Lifecycle(peer.node, peer.executor, NAME, monotonic() + PATIENCE)
 
@@ -252,6 +259,20 @@ def test_states_without_a_stamp_are_rejected_and_said(peer):
         peer.until_status(NAME, lambda s: said in s["message"], "the reason")
 
 
+def test_a_waiting_controller_is_a_warning_however_late_its_loop(peer):
+    peer.hear_diagnostics()
+
+    with processes(NodeProcess(NAME, **Sensors.patient)) as (node,):
+        next_report(peer)
+        node.send(signal.SIGSTOP)
+        peer.spin(0.3)  # some hundred periods
+        node.send(signal.SIGCONT)
+        next_report(peer)
+        next_report(peer)
+        waiting = "waiting for motor/state, motor/current, reference_position"
+        assert {(s.level[0], s.message) for s in peer.diagnostics} == {(1, waiting)}
+
+
 def test_a_profile_of_its_own_waits_for_the_hand(peer):
     peer.hear("motor_voltage", "reference_position")
     peer.hear_diagnostics()
@@ -261,28 +282,23 @@ def test_a_profile_of_its_own_waits_for_the_hand(peer):
     def references() -> list[float]:
         return [convert.float64_value(data) for data in peer.heard["reference_position"]]
 
-    def next_report() -> Mapping[str, str]:
-        before = len(peer.diagnostics)
-        peer.until(lambda: len(peer.diagnostics) > before, what="the next report")
-        return peer.status(NAME)
-
     with processes(NodeProcess(NAME, reference="half_sine", reference_period=400.0, **Sensors.patient)):
         for name in ("encoder_position", "motor_current"):
             peer.matched(name)
-        next_report()
-        next_report()  # a second of waiting
+        next_report(peer)
+        next_report(peer)  # a second of waiting
         assert references() == []
         sensors.until(lambda s: s["message"].startswith("running"), "a driven motor")
         assert references()[0] == profile[0]
         peer.until_status(NAME, lambda s: int(s["state_timeouts"]) > 0, "the timeout")
         stands = len(references())
-        next_report()
-        next_report()  # a second without sensors
+        next_report(peer)
+        next_report(peer)  # a second without sensors
         sensors.until(lambda s: s["message"].startswith("running"), "a driven motor again")
         given = references()
         assert len(given) > stands
         # one period for each reference, besides those that a busy machine made the loop miss
-        missed = int(next_report()["missed_cycles"])
+        missed = int(next_report(peer)["missed_cycles"])
         assert np.searchsorted(profile[:100_000], given[-1]) < len(given) + missed
 
 

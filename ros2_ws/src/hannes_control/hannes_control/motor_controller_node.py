@@ -319,6 +319,7 @@ class MotorController(HannesNode, LifecycleNode):
             self._tripped = True
             return
         if self._state is None or self._current is None:
+            self._missed -= elapsed - 1  # nothing was to be done in them
             return
         if now - min(self._state_at, self._current_at) > self._p.state_timeout_ms / 1e3:
             if not self._stale:
