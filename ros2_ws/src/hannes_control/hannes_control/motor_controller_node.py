@@ -12,7 +12,7 @@ from hannes_description.errors import HannesError
 from hannes_description.joints import RAD_PER_COUNT
 from hannes_description.model import Model
 from hannes_ros import convert, topics
-from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
+from hannes_ros.diagnostics import ERROR, OK, WARN, Arrivals, Diagnostics, Health
 from hannes_ros.lockstep import SETTLE_S, Peers, TickJoin
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
@@ -25,6 +25,7 @@ from .double_pid import DoublePID
 from .reference import FULL_CLOSURE, PROFILES, Profile, check_travel, make_profile, travel_of
 
 _CHECK_S = 0.02
+_SLOWEST_STATE_HZ = 80.0
 _ZERO = convert.float64_bytes(0.0)
 
 
@@ -108,6 +109,7 @@ class MotorController(HannesNode, LifecycleNode):
         self._health = Health(
             "rejected_states", "rejected_inputs", "limited_references", "state_timeouts", "trips", "resets"
         )
+        self._arrivals = Arrivals()
         self._state: convert.JointSample | None = None
         self._current: float | None = None
         self._reference: float | None = None
@@ -291,6 +293,7 @@ class MotorController(HannesNode, LifecycleNode):
             return
         self._health.faults.good("motor/state")
         self._state, self._state_at = sample, monotonic()
+        self._arrivals.came(self._state_at)
 
     def _wrong_stamp(self, stamp_ns: int, age: float) -> str:
         """What is wrong with a stamp that is `age` s old, or ahead where that is negative."""
@@ -351,6 +354,7 @@ class MotorController(HannesNode, LifecycleNode):
             self._join.rejoin()
         self._heard = sample.stamp_ns
         self._put(0, sample)
+        self._arrivals.came(self._state_at)
 
     def _on_tick_current(self, data: bytes) -> None:
         self._put(1, self._decode_current(data))
@@ -407,6 +411,18 @@ class MotorController(HannesNode, LifecycleNode):
             self.trigger_deactivate()
             self._diagnostics.publish()
 
+    def _state_rate(self) -> str:
+        """Rate of motor/state; in real time too low a one is a fault."""
+        rate = self._arrivals.rate()
+        if rate is None or rate >= _SLOWEST_STATE_HZ or self._lockstep:
+            self._health.faults.good("rate")
+        else:
+            said = (
+                f"motor/state comes at {rate:.0f} Hz: the loop needs 100 Hz, or it oscillates; best is 1 kHz"
+            )
+            self._health.faults.bad("rate", WARN, said)
+        return "" if rate is None else f"{rate:.1f}"
+
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         self._health.last_input = self._state_at or None
         age = f"{monotonic() - self._reference_at:.3f}" if self._reference_at else ""
@@ -415,6 +431,7 @@ class MotorController(HannesNode, LifecycleNode):
             "active": self._active,
             "battery_saver": self._pid.saving,
             "reference_age_s": age,
+            "state_rate_hz": self._state_rate(),
         }
         if not self._active:
             return WARN, "not active: motor off" + ("; activate again" if self._tripped else ""), values

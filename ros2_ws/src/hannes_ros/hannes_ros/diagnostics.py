@@ -106,6 +106,32 @@ class Rate:
         return rate
 
 
+class Arrivals:
+    """Rate of the messages of a topic by the times of their arrival, whenever it is looked at."""
+
+    def __init__(self) -> None:
+        self._first: float | None = None
+        self._last = 0.0
+        self._count = 0
+
+    def came(self, now: float) -> None:
+        """A message came at `now` (s, monotonic)."""
+        if self._first is None:
+            self._first = now
+        else:
+            self._count += 1
+        self._last = now
+
+    def rate(self) -> float | None:
+        """Rate (1/s) since the last look; None where too few came."""
+        if self._first is None or not self._count:
+            self._first = None
+            return None
+        rate = self._count / max(self._last - self._first, 1e-9)
+        self._first, self._count = self._last, 0
+        return rate
+
+
 def missed_level(done: int, missed: int) -> bytes:
     """Level of a loop that did and missed so many cycles lately."""
     share = missed / max(1, done + missed)
