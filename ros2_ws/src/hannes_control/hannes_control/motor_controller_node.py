@@ -41,7 +41,7 @@ class MotorControllerParameters:
     )
     reference: str = parameter(
         "topic",
-        "topic, or a profile of its own from the first state and current after the activation on",
+        "topic, or a profile of its own from the first state and current after activation on",
         choices=("topic", *PROFILES),
     )
     reference_closures: int = parameter(1, "closures of the profile", lower=1, upper=100000)
