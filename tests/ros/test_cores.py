@@ -9,7 +9,7 @@ from time import sleep
 import pytest
 from hannes_description.errors import HannesError
 from hannes_ros.command import CommandGate
-from hannes_ros.diagnostics import ERROR, OK, WARN, Rate, missed_level
+from hannes_ros.diagnostics import ERROR, OK, SAY_AGAIN_S, WARN, Arrivals, Faults, Rate, missed_level
 from hannes_ros.lockstep import Peers, StallWatch, TickJoin, samples_until
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.run import _node_rules
@@ -145,6 +145,39 @@ def test_rate_is_between_two_looks():
     rate = Rate(now=10.0)
     assert rate.update(12.0, 100) == pytest.approx(50.0)
     assert rate.update(13.0, 100) == 0.0
+
+
+def test_a_fault_is_reported_once_at_least_and_logged_now_and_then():
+    faults = Faults()
+    assert faults.report(0.0) == []
+    faults.bad("current", ERROR, "nan")
+    faults.good("current")  # short, and seen all the same
+    assert "current" in faults
+    assert faults.report(1.0) == [(ERROR, "nan", True)]
+    assert faults.report(2.0) == []
+    faults.bad("current", ERROR, "inf")
+    faults.bad("state", WARN, "old")
+    assert faults.report(3.0) == [(ERROR, "inf", False), (WARN, "old", True)]
+    assert faults.report(4.0) == [(ERROR, "inf", False), (WARN, "old", False)]  # they stand
+    faults.bad("current", ERROR, "inf")
+    faults.good("state")
+    assert faults.report(1.0 + SAY_AGAIN_S) == [(ERROR, "inf", True)]
+    faults.good("current")
+    assert "current" not in faults
+
+
+def test_rate_of_arrivals_counts_from_the_first_message():
+    arrivals = Arrivals()
+    assert arrivals.rate() is None
+    for k in range(11):
+        arrivals.came(0.7 + 0.01 * k)
+    assert arrivals.rate() == pytest.approx(100.0)
+    arrivals.came(0.82)  # a look changes nothing
+    assert arrivals.rate() == pytest.approx(50.0)
+    assert arrivals.rate() is None
+    arrivals.came(100.0)  # after a rest it begins anew
+    arrivals.came(100.5)
+    assert arrivals.rate() == pytest.approx(2.0)
 
 
 def test_missed_cycles_warn_and_then_are_an_error():

@@ -7,8 +7,9 @@ import math
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
-from time import monotonic
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from graph import NodeProcess, Peer, kept_waiting, processes
 from hannes_bringup import motor_switch
 from hannes_bringup.motor_switch import Lifecycle
 from hannes_control.double_pid import DoublePID
+from hannes_control.reference import half_sine
 from hannes_description.model import Model
 from hannes_ros import convert
 from lifecycle_msgs.msg import Transition
@@ -46,6 +48,13 @@ def announce(peer: Peer) -> None:
 
 def voltages(peer: Peer) -> list[float]:
     return [convert.float64_value(data) for data in peer.heard["motor_voltage"]]
+
+
+def next_report(peer: Peer) -> Mapping[str, str]:
+    """The next diagnostics, with the controller as the only node."""
+    before = len(peer.diagnostics)
+    peer.until(lambda: len(peer.diagnostics) > before, what="the next report")
+    return peer.status(NAME)
 
 
 def lifecycle(peer: Peer) -> Lifecycle:
@@ -101,6 +110,11 @@ def test_a_profile_beyond_the_travel_of_the_hand_is_refused(ros_environment):
         assert "amplitude is 20 rad, but the hand is fully closed at 15.6 rad" in node.output
 
 
+def drives(status: Mapping[str, str]) -> bool:
+    """All is well, but for the rate at which a busy machine lets the test send."""
+    return status["message"].startswith(("running", "motor/state comes at"))
+
+
 def test_wrong_joint_and_not_finite_inputs_are_rejected_and_counted(peer):
     peer.hear("motor_voltage")
     peer.hear_diagnostics()
@@ -116,6 +130,199 @@ def test_wrong_joint_and_not_finite_inputs_are_rejected_and_counted(peer):
         assert voltages(peer)[2] > 0.0
         rejected = "motor/state is rejected: the joints are ['elbow'], expected ['motor_pulley']"
         peer.until(lambda: rejected in node.output, what="the reason in the log")
+
+
+def test_a_reference_that_is_not_finite_leaves_the_last_good_one(peer):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    law = DoublePID.of_model(Model.load("nominal").parameters)
+    with processes(NodeProcess(NAME, clock="lockstep")) as (node,):
+        announce(peer)
+        for tick, reference in enumerate((math.nan, 5.0, math.nan, math.inf)):
+            say_tick(peer, tick, 1.0, 0.5, reference)
+            peer.until(lambda tick=tick: len(voltages(peer)) == tick + 1, what=f"voltage {tick}")
+        assert voltages(peer) == [0.0, *(law.update(5.0, 1.0, 0.5) for _ in range(3))]
+        said = "reference_position is not finite (inf): the last good one holds"
+        bad = peer.until_status(NAME, lambda s: s["message"] == said, "the rejected reference")
+        assert (bad["level"], bad["rejected_inputs"]) == ("1", "3")
+        peer.until(lambda: "reference_position is not finite (" in node.output, what="the reason in the log")
+        say_tick(peer, 4, 1.0, 0.5, 6.0)
+        peer.until(lambda: len(voltages(peer)) == 5)
+        assert voltages(peer)[4] == law.update(6.0, 1.0, 0.5)
+        peer.until_status(NAME, lambda s: "not finite" not in s["message"] and s["level"] == "0", "all well")
+
+
+def test_a_reference_beyond_the_travel_of_the_hand_is_limited(peer):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    law = DoublePID.of_model(Model.load("nominal").parameters)
+    close_to = 15.6 + 1e-6  # rounding is no reason to say a word
+    with processes(NodeProcess(NAME, clock="lockstep")) as (node,):
+        announce(peer)
+        for tick, reference in enumerate((close_to, -60.0, 400.0)):
+            say_tick(peer, tick, 14.0, 0.5, reference)
+            peer.until(lambda tick=tick: len(voltages(peer)) == tick + 1, what=f"voltage {tick}")
+        assert voltages(peer) == [law.update(reference, 14.0, 0.5) for reference in (close_to, 0.0, 15.6)]
+        said = "reference_position of 400 rad is limited to 0 .. 15.6 rad, the travel of the hand"
+        status = peer.until_status(NAME, lambda s: s["message"] == said, "the limited reference")
+        assert (status["level"], status["limited_references"]) == ("1", "2")
+        peer.until(lambda: "is limited to 0 .. 15.6 rad" in node.output, what="the reason in the log")
+        say_tick(peer, 3, 14.0, 0.5, 14.0)
+        peer.until_status(NAME, lambda s: "limited to" not in s["message"] and s["level"] == "0", "all well")
+
+
+@dataclass
+class Sensors:
+    """State, current and reference in real time, as a board would send them; long limits, for a busy machine."""
+
+    peer: Peer
+    position: float = 1.0
+    current: float = 0.1
+    reference: float | None = 5.0
+    stamped_ahead: float = 0.0
+    patient = {"clock": "realtime", "pause_limit_ms": 10000, "state_timeout_ms": 3000}
+
+    def say(self) -> None:
+        now = self.peer.node.get_clock().now().nanoseconds + round(self.stamped_ahead * 1e9)
+        self.peer.say("encoder_position", state_bytes(now, self.position))
+        self.peer.say("motor_current", convert.float64_bytes(self.current))
+        if self.reference is not None:
+            self.peer.say("reference_position", convert.float64_bytes(self.reference))
+        self.peer.executor.spin_once(timeout_sec=0.001)
+
+    def until(self, condition: Callable[[Mapping[str, str]], bool], what: str) -> Mapping[str, str]:
+        """Send, without a pause, until the controller's status is that."""
+        end = monotonic() + PATIENCE
+        while not (status := self.peer.status(NAME)) or not condition(status):
+            assert monotonic() < end, f"not within {PATIENCE} s: {what}"
+            self.say()
+        return status
+
+
+@pytest.mark.parametrize(
+    ("bad", "said", "level"),
+    (
+        ({"current": math.nan}, "motor/current is not finite (nan): 0 V", "2"),
+        ({"position": math.nan}, "position of motor/state is not finite (nan): 0 V", "2"),
+        ({"reference": math.nan}, "reference_position is not finite (nan): the last good one holds", "1"),
+        ({"reference": 400.0}, "reference_position of 400 rad is limited to 0 .. 15.6 rad", "1"),
+    ),
+)
+def test_bad_inputs_are_said_until_good_ones_come(peer, bad, said, level):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    sensors = Sensors(peer)
+    with processes(NodeProcess(NAME, **Sensors.patient)) as (node,):
+        announce(peer)
+        sensors.until(drives, "a driven motor")
+        for name, value in bad.items():
+            setattr(sensors, name, value)
+        status = sensors.until(lambda s: said in s["message"], "the rejected input")
+        assert status["level"] >= level
+        assert (voltages(peer)[-1] == 0.0) is (level == "2")
+        peer.until(lambda: said in node.output, what="the reason in the log")
+        sensors.position, sensors.current, sensors.reference = 1.0, 0.1, 5.0
+        sensors.until(drives, "all well again")
+        assert voltages(peer)[-1] > 0.0
+
+
+@pytest.mark.parametrize(("ahead", "said"), ((-60.0, " s before "), (60.0, " s after ")))
+def test_states_of_another_clock_are_rejected_and_said(peer, ahead, said):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    sensors = Sensors(peer, stamped_ahead=ahead)
+    with processes(NodeProcess(NAME, **Sensors.patient)) as (node,):
+        announce(peer)
+        status = sensors.until(lambda s: "motor/state is rejected" in s["message"], "the reason")
+        assert said + "the clock of this machine (for a played bag set use_sim_time)" in status["message"]
+        assert "waiting for motor/state" not in status["message"]
+        assert status["level"] == "2"
+        assert voltages(peer) == []
+        peer.until(
+            lambda: "motor/state is rejected: it is stamped" in node.output, what="the reason in the log"
+        )
+        sensors.stamped_ahead = 0.0
+        before = int(sensors.until(drives, "a motor")["rejected_states"])
+        # a single one costs no other: those that follow it are not older than it
+        sensors.stamped_ahead = ahead
+        sensors.say()
+        sensors.stamped_ahead = 0.0
+        status = sensors.until(lambda s: int(s["rejected_states"]) > before, "one more rejected")
+        assert (int(status["rejected_states"]), status["state_timeouts"]) == (before + 1, "0")
+
+
+def test_states_without_a_stamp_are_rejected_and_said(peer):
+    peer.hear_diagnostics()
+    with processes(NodeProcess(NAME, **Sensors.patient)):
+        announce(peer)
+        peer.say("encoder_position", state_bytes(0, 1.0))
+        said = "motor/state is rejected: no stamp by the clock of this machine"
+        peer.until_status(NAME, lambda s: said in s["message"], "the reason")
+
+
+def test_states_that_come_too_slowly_are_said(peer):
+    peer.hear_diagnostics()
+    sensors = Sensors(peer)
+    with processes(NodeProcess(NAME, **Sensors.patient)) as (node,):
+        announce(peer)
+
+        def slow() -> bool:
+            sensors.say()
+            sleep(0.05)
+            return peer.status(NAME).get("message", "").startswith("motor/state comes at ")
+
+        peer.until(slow, what="a warning")
+        status = peer.status(NAME)
+        assert status["level"] == "1"
+        assert float(status["state_rate_hz"]) < 80.0
+        peer.until(
+            lambda: "Hz: the loop needs 100 Hz, or it oscillates" in node.output, what="the reason in the log"
+        )
+        status = sensors.until(lambda s: s["message"].startswith("running"), "faster states")
+        assert float(status["state_rate_hz"]) >= 80.0
+
+
+def test_a_waiting_controller_is_a_warning_however_late_its_loop(peer):
+    peer.hear_diagnostics()
+
+    with processes(NodeProcess(NAME, **Sensors.patient)) as (node,):
+        next_report(peer)
+        node.send(signal.SIGSTOP)
+        peer.spin(0.3)  # some hundred periods
+        node.send(signal.SIGCONT)
+        next_report(peer)
+        next_report(peer)
+        waiting = "waiting for motor/state, motor/current, reference_position"
+        assert {(s.level[0], s.message) for s in peer.diagnostics} == {(1, waiting)}
+
+
+def test_a_profile_of_its_own_waits_for_the_hand(peer):
+    peer.hear("motor_voltage", "reference_position")
+    peer.hear_diagnostics()
+    sensors = Sensors(peer, reference=None)
+    profile = half_sine(period=400.0)  # 100 s of closing: it tells which period a reference is of
+
+    def references() -> list[float]:
+        return [convert.float64_value(data) for data in peer.heard["reference_position"]]
+
+    with processes(NodeProcess(NAME, reference="half_sine", reference_period=400.0, **Sensors.patient)):
+        for name in ("encoder_position", "motor_current"):
+            peer.matched(name)
+        next_report(peer)
+        next_report(peer)  # a second of waiting
+        assert references() == []
+        sensors.until(drives, "a driven motor")
+        assert references()[0] == profile[0]
+        peer.until_status(NAME, lambda s: int(s["state_timeouts"]) > 0, "the timeout")
+        stands = len(references())
+        next_report(peer)
+        next_report(peer)  # a second without sensors
+        sensors.until(drives, "a driven motor again")
+        given = references()
+        assert len(given) > stands
+        # one period for each reference, besides those that a busy machine made the loop miss
+        missed = int(next_report(peer)["missed_cycles"])
+        assert np.searchsorted(profile[:100_000], given[-1]) < len(given) + missed
 
 
 def test_the_motor_is_driven_only_while_active_and_activation_clears_the_integrator(peer):
@@ -189,6 +396,42 @@ def test_hannes_motor_switches_a_running_controller(peer):
     wrong = motor("on", "--node", "/no name!")
     assert wrong.returncode == 2
     assert wrong.stderr.count("\n") == 1 and "'/no name!' is no name of a node" in wrong.stderr
+
+
+def test_a_transition_that_the_state_does_not_allow_is_refused_and_the_node_lives(peer):
+    with processes(NodeProcess(NAME, clock="realtime", autostart=False)) as (node,):
+        for possible, number, state in (
+            (False, Transition.TRANSITION_ACTIVATE, "unconfigured"),
+            (False, 77, "unconfigured"),
+            (True, Transition.TRANSITION_CONFIGURE, "inactive"),
+            (False, Transition.TRANSITION_CONFIGURE, "inactive"),
+            (False, Transition.TRANSITION_DEACTIVATE, "inactive"),
+            (True, Transition.TRANSITION_ACTIVATE, "active"),
+            (False, Transition.TRANSITION_ACTIVATE, "active"),
+            (True, Transition.TRANSITION_ACTIVE_SHUTDOWN, "finalized"),
+            (False, Transition.TRANSITION_ACTIVATE, "finalized"),
+        ):
+            assert transition(peer, number) is possible
+            assert lifecycle(peer).state() == state
+        assert node.process.poll() is None
+        assert "Traceback" not in node.output
+
+
+class Hurried(Lifecycle):
+    """Somebody else makes each transition a moment before."""
+
+    def change(self, transition: int) -> bool:
+        assert super().change(transition)
+        return super().change(transition)
+
+
+def test_the_motor_is_switched_by_two_at_once(peer, monkeypatch):
+    monkeypatch.setattr(motor_switch, "Lifecycle", Hurried)
+    monkeypatch.setattr(motor_switch, "_PATIENCE_S", PATIENCE)
+    with processes(NodeProcess(NAME, clock="lockstep", autostart=False)):
+        name = f"{peer.node.get_namespace().rstrip('/')}/{NAME}"
+        assert motor_switch.switch(name, True, PATIENCE) == "active"
+        assert motor_switch.switch(name, False, PATIENCE) == "inactive"
 
 
 class Deaf:

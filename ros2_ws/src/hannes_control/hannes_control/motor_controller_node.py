@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass
 from time import monotonic
 
 import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 from hannes_description.errors import HannesError
+from hannes_description.joints import RAD_PER_COUNT
 from hannes_description.model import Model
 from hannes_ros import convert, topics
-from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
+from hannes_ros.diagnostics import ERROR, OK, WARN, Arrivals, Diagnostics, Health
 from hannes_ros.lockstep import SETTLE_S, Peers, TickJoin
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from .double_pid import DoublePID
-from .reference import FULL_CLOSURE, PROFILES, Profile, check_travel, make_profile
+from .reference import FULL_CLOSURE, PROFILES, Profile, check_travel, make_profile, travel_of
 
 _CHECK_S = 0.02
+_SLOWEST_STATE_HZ = 80.0
 _ZERO = convert.float64_bytes(0.0)
 
 
@@ -36,7 +40,9 @@ class MotorControllerParameters:
         True, "configure and activate at start; otherwise wait for the lifecycle services"
     )
     reference: str = parameter(
-        "topic", "topic, or a profile of its own from the activation on", choices=("topic", *PROFILES)
+        "topic",
+        "topic, or a profile of its own from the first state and current after activation on",
+        choices=("topic", *PROFILES),
     )
     reference_closures: int = parameter(1, "closures of the profile", lower=1, upper=100000)
     reference_amplitude: float = parameter(
@@ -97,15 +103,19 @@ class MotorController(HannesNode, LifecycleNode):
         self._profile = p.profile()
         if self._profile is not None:
             check_travel(p.reference_amplitude, model.parameters)
+        self._travel = travel_of(model.parameters)
         self._lockstep = p.clock == "lockstep"
         self._active = self._tripped = False
-        self._health = Health("rejected_states", "rejected_inputs", "state_timeouts", "trips", "resets")
+        self._health = Health(
+            "rejected_states", "rejected_inputs", "limited_references", "state_timeouts", "trips", "resets"
+        )
+        self._arrivals = Arrivals()
         self._state: convert.JointSample | None = None
         self._current: float | None = None
         self._reference: float | None = None
         self._state_at = self._current_at = self._reference_at = 0.0
         self._stale = False
-        self._start = 0
+        self._played = -1
         self._answered = self._heard = -1
         self._period_ns = round(p.period * 1e9)
         self._join = TickJoin(2 if self._profile is not None else 3)
@@ -141,6 +151,19 @@ class MotorController(HannesNode, LifecycleNode):
             self.trigger_activate()
 
     # -- life cycle --------------------------------------------------------------------------------------------------
+    def _LifecycleNodeMixin__change_state(self, transition_id: int) -> TransitionCallbackReturn:
+        """rclpy's way into every transition: by the service and by `trigger_*`.
+
+        Where the state does not allow the transition rclpy raises, which would end the node; here it is a failure.
+        """
+        try:
+            return super()._LifecycleNodeMixin__change_state(transition_id)  # type: ignore[misc]
+        except rclpy_implementation.RCLError:
+            self.get_logger().warning(
+                f"transition {transition_id} is not possible in this state: nothing done"
+            )
+            return TransitionCallbackReturn.FAILURE
+
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Ready, motor off."""
         self._pid.reset()
@@ -154,7 +177,7 @@ class MotorController(HannesNode, LifecycleNode):
             if self._join.synchronised:
                 self._answer()
         else:
-            self._start = -1
+            self._played = -1
             self._loop = RealtimeLoop(self._p.period, self._step)
             self._loop.start()
         return TransitionCallbackReturn.SUCCESS
@@ -188,23 +211,67 @@ class MotorController(HannesNode, LifecycleNode):
         self._health.count("resets")
 
     # -- the law -----------------------------------------------------------------------------------------------------
-    def _command(self, reference: float, position: float, current: float) -> float:
-        """Voltage (V), clamped; what is not finite gives 0 V and a cleared controller."""
+    def _command(self, reference: float | None, position: float, current: float) -> float:
+        """Voltage (V), clamped; a sensor that is not finite gives 0 V and a cleared controller, no reference 0 V."""
+        if reference is None:
+            return 0.0
         try:
             voltage = self._pid.update(reference, position, current)
         except HannesError:
-            self._health.count("rejected_inputs")
             self._clear()
             return 0.0
         return min(max(voltage, -self._limit), self._limit)
 
     def _decode(self, data: bytes) -> convert.JointSample | None:
         try:
-            return convert.MOTOR_STATE.decode(data)
+            sample = convert.MOTOR_STATE.decode(data)
         except HannesError as error:
-            self._health.count("rejected_states")
-            self.get_logger().error(f"motor/state is rejected: {error}", throttle_duration_sec=5.0)
+            self._reject_state(ERROR, str(error))
             return None
+        self._finite("position of motor/state", sample.position[0], ERROR, "0 V")
+        return sample
+
+    def _reject_state(self, level: bytes, why: str) -> None:
+        self._health.count("rejected_states")
+        self._health.faults.bad("motor/state", level, f"motor/state is rejected: {why}")
+
+    def _decode_current(self, data: bytes) -> float:
+        current = convert.float64_value(data)
+        self._finite("motor/current", current, ERROR, "0 V")
+        return current
+
+    def _decode_reference(self, data: bytes) -> float | None:
+        """The reference (rad) from here on: within the hand's travel, beyond which the motor would stall or unwind.
+
+        One that is not finite leaves the last good one, None if there was none.
+        """
+        value = convert.float64_value(data)
+        instead = "0 V" if self._reference is None else "the last good one holds"
+        if self._finite("reference_position", value, WARN, instead):
+            self._reference, self._reference_at = self._limited(value), monotonic()
+        return self._reference
+
+    def _limited(self, reference: float) -> float:
+        limited = min(max(reference, 0.0), self._travel)
+        if abs(reference - limited) <= RAD_PER_COUNT:  # rounding
+            self._health.faults.good("travel")
+            return reference
+        self._health.count("limited_references")
+        self._health.faults.bad(
+            "travel",
+            WARN,
+            f"reference_position of {reference:g} rad is limited to 0 .. {self._travel:g} rad, the travel of the hand",
+        )
+        return limited
+
+    def _finite(self, name: str, value: float, level: bytes, instead: str) -> bool:
+        """Whether an input is finite; if not it is counted and reported, with what is done instead."""
+        if math.isfinite(value):
+            self._health.faults.good(name)
+            return True
+        self._health.count("rejected_inputs")
+        self._health.faults.bad(name, level, f"{name} is not finite ({value}): {instead}")
+        return False
 
     def _profile_at(self, tick: int) -> float:
         assert self._profile is not None and self._own_reference is not None
@@ -217,28 +284,45 @@ class MotorController(HannesNode, LifecycleNode):
         sample = self._decode(data)
         if sample is None:
             return
-        age_ns = self.get_clock().now().nanoseconds - sample.stamp_ns
-        backwards = self._state is not None and sample.stamp_ns <= self._state.stamp_ns and not self._stale
-        if backwards or age_ns > self._p.state_timeout_ms * 1e6:
-            self._health.count("rejected_states")
+        age = (self.get_clock().now().nanoseconds - sample.stamp_ns) * 1e-9
+        if abs(age) > self._p.state_timeout_ms / 1e3:
+            self._reject_state(ERROR, self._wrong_stamp(sample.stamp_ns, age))
             return
+        if self._state is not None and sample.stamp_ns <= self._state.stamp_ns and not self._stale:
+            self._reject_state(WARN, "its stamp is not later than the one before")
+            return
+        self._health.faults.good("motor/state")
         self._state, self._state_at = sample, monotonic()
+        self._arrivals.came(self._state_at)
+
+    def _wrong_stamp(self, stamp_ns: int, age: float) -> str:
+        """What is wrong with a stamp that is `age` s old, or ahead where that is negative."""
+        if self.get_clock().ros_time_is_active:
+            clock = "/clock (use_sim_time)"
+        else:
+            clock = "the clock of this machine (for a played bag set use_sim_time)"
+        off = (
+            f"it is stamped {abs(age):.3g} s {'before' if age > 0.0 else 'after'}"
+            if stamp_ns
+            else "no stamp by"
+        )
+        return f"{off} {clock}; {self._p.state_timeout_ms / 1e3:g} s are allowed"
 
     def _on_current(self, data: bytes) -> None:
-        self._current, self._current_at = convert.float64_value(data), monotonic()
+        self._current, self._current_at = self._decode_current(data), monotonic()
 
     def _on_reference(self, data: bytes) -> None:
-        self._reference, self._reference_at = convert.float64_value(data), monotonic()
+        self._decode_reference(data)
 
     def _step(self, now: float, elapsed: int) -> None:
         """One period of the real-time thread."""
-        self._start += elapsed
         if not self._active or self._tripped:
             return
         if elapsed * self._p.period * 1e3 > self._p.pause_limit_ms:
             self._tripped = True
             return
         if self._state is None or self._current is None:
+            self._missed -= elapsed - 1  # nothing was to be done in them
             return
         if now - min(self._state_at, self._current_at) > self._p.state_timeout_ms / 1e3:
             if not self._stale:
@@ -248,10 +332,10 @@ class MotorController(HannesNode, LifecycleNode):
             voltage = 0.0
         else:
             self._stale = False
-            reference = self._reference if self._profile is None else self._profile_at(self._start)
-            voltage = (
-                0.0 if reference is None else self._command(reference, self._state.position[0], self._current)
-            )
+            # a profile begins with the first period that has live sensors, and stands while they are stale
+            self._played += elapsed if self._played >= 0 else 1
+            reference = self._reference if self._profile is None else self._profile_at(self._played)
+            voltage = self._command(reference, self._state.position[0], self._current)
         self._voltage.publish(convert.float64_bytes(voltage))
         self._health.cycles += 1
 
@@ -260,20 +344,23 @@ class MotorController(HannesNode, LifecycleNode):
         sample = self._decode(data)
         if sample is None:
             return
+        self._health.faults.good("motor/state")
         if sample.stamp_ns < self._answered:  # the simulator began again
             self._join.reset()
             self._answered = self._heard = -1
+            self._reference = None
             self._clear()
         elif sample.stamp_ns == self._heard:  # repeated to a newcomer
             self._join.rejoin()
         self._heard = sample.stamp_ns
         self._put(0, sample)
+        self._arrivals.came(self._state_at)
 
     def _on_tick_current(self, data: bytes) -> None:
-        self._put(1, convert.float64_value(data))
+        self._put(1, self._decode_current(data))
 
     def _on_tick_reference(self, data: bytes) -> None:
-        self._put(2, convert.float64_value(data))
+        self._put(2, self._decode_reference(data))
 
     def _put(self, slot: int, item: object) -> None:
         self._state_at = monotonic()
@@ -324,6 +411,18 @@ class MotorController(HannesNode, LifecycleNode):
             self.trigger_deactivate()
             self._diagnostics.publish()
 
+    def _state_rate(self) -> str:
+        """Rate of motor/state; in real time too low a one is a fault."""
+        rate = self._arrivals.rate()
+        if rate is None or rate >= _SLOWEST_STATE_HZ or self._lockstep:
+            self._health.faults.good("rate")
+        else:
+            said = (
+                f"motor/state comes at {rate:.0f} Hz: the loop needs 100 Hz, or it oscillates; best is 1 kHz"
+            )
+            self._health.faults.bad("rate", WARN, said)
+        return "" if rate is None else f"{rate:.1f}"
+
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         self._health.last_input = self._state_at or None
         age = f"{monotonic() - self._reference_at:.3f}" if self._reference_at else ""
@@ -332,6 +431,7 @@ class MotorController(HannesNode, LifecycleNode):
             "active": self._active,
             "battery_saver": self._pid.saving,
             "reference_age_s": age,
+            "state_rate_hz": self._state_rate(),
         }
         if not self._active:
             return WARN, "not active: motor off" + ("; activate again" if self._tripped else ""), values
@@ -350,7 +450,7 @@ class MotorController(HannesNode, LifecycleNode):
                 (self._state, self._current, self._reference if self._profile is None else 0.0),
                 strict=True,
             )
-            if value is None
+            if value is None and name not in self._health.faults
         ]
         return (WARN, f"waiting for {', '.join(absent)}", values) if absent else (OK, "running", values)
 

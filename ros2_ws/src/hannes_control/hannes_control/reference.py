@@ -86,9 +86,14 @@ PROFILES: Mapping[str, Callable[..., Profile]] = {
 """Profiles by name, for nodes and the command line."""
 
 
+def travel_of(parameters: ParameterSet) -> float:
+    """Encoder position (rad) of the closed hand, infinite where the parameters do not say it; the open hand is at 0."""
+    return parameters.value("hand.travel") if "hand.travel" in parameters else math.inf
+
+
 def check_travel(amplitude: float, parameters: ParameterSet) -> None:
     """Refuse an amplitude (rad) beyond the hand's travel, where the parameters say it: the motor would stall there."""
-    travel = parameters.value("hand.travel") if "hand.travel" in parameters else math.inf
+    travel = travel_of(parameters)
     if amplitude > travel:
         raise HannesError(
             f"Reference profile: amplitude is {amplitude:g} rad, but the hand is fully closed at {travel:g} rad "

@@ -1,12 +1,13 @@
 """Health of a node on /diagnostics, once a second of wall time.
 
-`Health` only counts; it has no clock and no ROS. `Diagnostics` publishes it with a steady timer, so that it also works
-while simulated time stands still.
+`Health` only counts, and holds the `Faults` of the inputs; it has no clock and no ROS. `Diagnostics` publishes it with
+a steady timer, so that it also works while simulated time stands still.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from threading import Lock
 from time import monotonic
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -26,14 +27,65 @@ MISSED_WARN, MISSED_ERROR = 0.01, 0.1
 """Share of missed cycles from which a node warns, and from which it reports an error."""
 
 
+SAY_AGAIN_S = 5.0
+"""s of wall time between two lines of log about the same fault."""
+
+
+class Faults:
+    """What is wrong with a node's inputs: by name a level and a sentence; for any thread.
+
+    A fault stands from `bad` to `good`, and in one report at least, so that a short one is seen too.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._standing: dict[str, tuple[bytes, str]] = {}
+        self._new: set[str] = set()
+        self._over: set[str] = set()
+        self._said: dict[str, float] = {}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._standing
+
+    def bad(self, name: str, level: bytes, text: str) -> None:
+        """That input was bad just now."""
+        with self._lock:
+            self._standing[name] = level, text
+            self._new.add(name)
+            self._over.discard(name)
+
+    def good(self, name: str) -> None:
+        """That input is good (again)."""
+        if name not in self._standing:
+            return
+        with self._lock:
+            if name in self._new:
+                self._over.add(name)
+            else:
+                self._standing.pop(name, None)
+
+    def report(self, now: float) -> list[tuple[bytes, str, bool]]:
+        """(level, sentence, whether it is due in the log) of those that stand or were not reported yet."""
+        with self._lock:
+            due = {name for name in self._new if now - self._said.get(name, -SAY_AGAIN_S) >= SAY_AGAIN_S}
+            self._said.update(dict.fromkeys(due, now))
+            report = [(*fault, name in due) for name, fault in self._standing.items()]
+            for name in self._over:
+                del self._standing[name]
+            self._new.clear()
+            self._over.clear()
+        return report
+
+
 class Health:
-    """Counters of a node: cycles done and missed, last input, and named events (timeouts, rejected messages)."""
+    """Counters of a node: cycles done and missed, last input, named events (timeouts, rejected messages); faults."""
 
     def __init__(self, *events: str) -> None:
         self.cycles = 0
         self.missed = 0
         self.last_input: float | None = None
         self.counts: dict[str, int] = dict.fromkeys(events, 0)
+        self.faults = Faults()
 
     def count(self, event: str, by: int = 1) -> None:
         """An event of that name happened."""
@@ -54,6 +106,32 @@ class Rate:
         return rate
 
 
+class Arrivals:
+    """Rate of the messages of a topic by the times of their arrival, whenever it is looked at."""
+
+    def __init__(self) -> None:
+        self._first: float | None = None
+        self._last = 0.0
+        self._count = 0
+
+    def came(self, now: float) -> None:
+        """A message came at `now` (s, monotonic)."""
+        if self._first is None:
+            self._first = now
+        else:
+            self._count += 1
+        self._last = now
+
+    def rate(self) -> float | None:
+        """Rate (1/s) since the last look; None where too few came."""
+        if self._first is None or not self._count:
+            self._first = None
+            return None
+        rate = self._count / max(self._last - self._first, 1e-9)
+        self._first, self._count = self._last, 0
+        return rate
+
+
 def missed_level(done: int, missed: int) -> bytes:
     """Level of a loop that did and missed so many cycles lately."""
     share = missed / max(1, done + missed)
@@ -64,6 +142,7 @@ class Diagnostics:
     """Publishes the health of one node.
 
     state   called for each report: (level, message, further values); may set `health.missed`
+    Faults of the inputs join the message, raise the level, and go to the log.
     A loop that missed more cycles than MISSED_WARN or MISSED_ERROR since the last report raises the level.
     """
 
@@ -84,6 +163,11 @@ class Diagnostics:
         """Report now."""
         now, health = monotonic(), self._health
         level, message, values = self._state()
+        for grade, text, due in health.faults.report(now):
+            message = text if level == OK else f"{message}; {text}"
+            level = max(level, grade)
+            if due:
+                self._log(grade, text)
         (done, missed), self._before = self._before, (health.cycles, health.missed)
         done, missed = health.cycles - done, health.missed - missed
         if missed_level(done, missed) > level:
@@ -110,3 +194,10 @@ class Diagnostics:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
+
+    def _log(self, level: bytes, text: str) -> None:
+        # two calls: rclpy takes one severity only from each line of code
+        if level >= ERROR:
+            self._node.get_logger().error(text)
+        else:
+            self._node.get_logger().warning(text)
