@@ -270,6 +270,11 @@ class MotorController(HannesNode, LifecycleNode):
         sample = self._decode(data)
         if sample is None:
             return
+        jumps = 0 <= self._heard < sample.stamp_ns - self._period_ns
+        if (jumps or (self._probe.held and sample.stamp_ns != self._heard)) and self._sources.mixed():
+            # No simulator leaves out ticks, or begins again while its tick is held.
+            self.fail(self._sources.surplus("encoder_position"))
+            return
         if sample.stamp_ns < self._answered:  # the simulator began again
             self._join.reset()
             self._answered = self._heard = -1

@@ -61,11 +61,16 @@ class Probe:
         """A publisher of an input was found or lost."""
         self.due = self.due or status.current_count > 1 or status.current_count_change < 0
 
+    @property
+    def held(self) -> bool:
+        """Whether a tick is held."""
+        return self._since is not None
+
     def holds(self) -> bool:
         """A tick is complete: whether its answer has to wait for `over`."""
         if self._since is None and self.due:
             self.due, self._since = False, monotonic()
-        return self._since is not None
+        return self.held
 
     def over(self) -> bool:
         """Called often: whether a held tick is to be looked at, and answered, now."""
