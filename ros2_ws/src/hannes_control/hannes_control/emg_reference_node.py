@@ -12,7 +12,7 @@ from time import monotonic
 import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 from hannes_description.errors import HannesError
 from hannes_ros import convert, topics
-from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
+from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health, silence
 from hannes_ros.lockstep import Peers, Probe, samples_until
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
@@ -25,6 +25,7 @@ from .emg import EmgIntegrator, EmgParameters
 _CHECK_S = 0.02
 _DEFAULT = EmgParameters()
 _CHANNELS = ("emg_flexor", "emg_extensor")
+_TOPICS = tuple(topics.signal(name).topic for name in _CHANNELS)
 _LONGEST_QUEUE = 1000
 """Samples of a channel that wait for the other channel or their tick, at most; its topic holds fewer."""
 
@@ -97,6 +98,7 @@ class EmgReferenceNode(HannesNode, Node):
             deque(maxlen=_LONGEST_QUEUE),
         )
         self._held = [0.0, 0.0]
+        self._heard: dict[str, float] = {}
         self._taken = 0
         self._stamp = -1
         self._ticks: deque[int] = deque(maxlen=_LONGEST_QUEUE)
@@ -128,7 +130,7 @@ class EmgReferenceNode(HannesNode, Node):
         else:
             self._health.count("rejected_samples")
         self._channels[number].append(self._held[number])
-        self._health.last_input = monotonic()
+        self._heard[_TOPICS[number]] = self._health.last_input = monotonic()
         if self._lockstep:
             self._answer()
         elif all(self._channels):
@@ -214,8 +216,12 @@ class EmgReferenceNode(HannesNode, Node):
             return ERROR, several, values
         if self._lockstep and (missing := self._peers.missing()):
             return WARN, f"waiting for {', '.join(missing)}", values
-        if self._health.last_input is None:
-            return WARN, "waiting for emg/flexor and emg/extensor", values
+        absent = [topic for topic in _TOPICS if topic not in self._heard]
+        if absent:
+            return WARN, f"waiting for {' and '.join(absent)}", values
+        # In lock-step there is nothing to hear while no tick waits for it.
+        if (self._ticks or not self._lockstep) and (silent := silence({t: self._heard[t] for t in _TOPICS})):
+            return WARN, f"{silent}: the reference stands", values
         if self._ticks:
             return OK, "waiting for EMG samples", values
         return OK, "running", values

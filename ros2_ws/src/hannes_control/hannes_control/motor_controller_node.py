@@ -10,7 +10,7 @@ import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_ros import convert, topics
-from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
+from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health, silence
 from hannes_ros.lockstep import SETTLE_S, Peers, Probe, TickJoin
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
@@ -383,7 +383,10 @@ class MotorController(HannesNode, LifecycleNode):
         names = ("motor/state", "motor/current", "reference_position")
         if self._lockstep:
             missing = [names[slot] for slot in self._join.missing()]
-            return OK, f"waiting for {', '.join(missing)}" if missing else "running", values
+            level = WARN if self._state_at and silence({"any message": self._state_at}) else OK
+            return (
+                (level, f"waiting for {', '.join(missing)}", values) if missing else (OK, "running", values)
+            )
         if self._stale:
             return ERROR, "motor/state or motor/current is too old: 0 V", values
         absent = [
@@ -395,7 +398,11 @@ class MotorController(HannesNode, LifecycleNode):
             )
             if value is None
         ]
-        return (WARN, f"waiting for {', '.join(absent)}", values) if absent else (OK, "running", values)
+        if absent:
+            return WARN, f"waiting for {', '.join(absent)}", values
+        if self._profile is None and (silent := silence({"reference_position": self._reference_at})):
+            return WARN, f"{silent}: the last one is held", values
+        return OK, "running", values
 
 
 def main() -> None:
