@@ -44,6 +44,6 @@ class Sources:
         return (
             f"{signal(name).topic} has more messages than the ticks need, and {count} "
             f"publisher{'' if count == 1 else 's'}. In lock-step it has one, which answers each tick once: end the "
-            "others (a bag that is played, ros2 topic pub, a second graph), give every node clock:=lockstep and the "
-            "same rate and period, and start the graph again."
+            "others (a bag that is played, ros2 topic pub, a second graph; a node that was killed counts for 20 s), "
+            "give every node clock:=lockstep and the same rate and period, and start the graph again."
         )
