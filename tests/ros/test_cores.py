@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import threading
 from time import sleep
+from types import SimpleNamespace
 
 import pytest
 from hannes_description.errors import HannesError
 from hannes_ros.command import CommandGate
 from hannes_ros.diagnostics import ERROR, OK, SAY_AGAIN_S, WARN, Arrivals, Faults, Rate, missed_level
-from hannes_ros.lockstep import Peers, StallWatch, TickJoin, samples_until
+from hannes_ros.lockstep import Peers, Probe, StallWatch, TickJoin, samples_until
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.run import _node_rules
 from patience import PATIENCE
@@ -79,6 +80,52 @@ def test_join_pairs_the_newest_until_the_first_answer_and_by_order_afterwards():
     join.reset()
     join.put(0, "state 0")
     assert join.take() is None
+
+
+def test_join_tells_of_messages_that_no_tick_needs_and_its_queues_are_bounded():
+    join = TickJoin(2, longest=3)
+    for k in range(
+        10
+    ):  # repetitions while the tick is joined: the newest count, as long as they keep together
+        join.put(0, k)
+        join.put(1, k)
+    assert join.surplus is None
+    assert join.take() == [9, 9]
+    join.synchronise()
+    for k in (10, 10, 11):
+        join.put(1, k)
+    assert join.left_over == 1
+    join.put(0, 10)
+    assert join.complete
+    assert join.take() == [10, 10]
+    for k in (12, 13):
+        join.put(1, k)
+    assert join.surplus == 1
+    join.rejoin()
+    assert (join.surplus, join.left_over) == (None, None)
+    for k in range(4):
+        join.put(0, k)
+    assert join.surplus == 0
+
+
+def test_a_tick_is_held_when_a_second_source_came_or_one_went_and_again_while_there_are_several(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("hannes_ros.lockstep.monotonic", lambda: now[0])
+    several = [False]
+    probe = Probe(lambda: several[0])
+    probe.on_match(SimpleNamespace(current_count=1, current_count_change=1))
+    assert (probe.over(), probe.holds()) == (False, False)
+    for count, change in ((2, 1), (1, -1)):
+        probe.on_match(SimpleNamespace(current_count=count, current_count_change=change))
+        assert (probe.holds(), probe.over(), probe.holds()) == (True, False, True)
+        now[0] += 1.5 * Probe.HOLD_S
+        assert (probe.over(), probe.over(), probe.holds()) == (True, False, False)
+    several[0] = True
+    for _ in range(3):
+        now[0] += 1.5 * Probe.REPEAT_S
+        assert (probe.over(), probe.holds()) == (False, True)
+        now[0] += 1.5 * Probe.HOLD_S
+        assert (probe.over(), probe.holds()) == (True, False)
 
 
 def test_peers_once_complete_stay_complete():

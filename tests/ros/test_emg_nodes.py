@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from itertools import pairwise
 from pathlib import Path
 
@@ -118,6 +119,19 @@ def test_reference_in_real_time_replaces_what_is_not_finite(peer):
         expected = [integrator.update(sample, 0.0) for sample in samples]
         peer.until(lambda: len(peer.heard["reference_position"]) == 150, what="references")
         status = peer.until_status("emg_reference", lambda s: s["samples"] == "150")
+        both = re.compile(r"no emg/flexor for \S+ s, no emg/extensor for \S+ s: the reference stands")
+        silent = peer.until_status(
+            "emg_reference", lambda s: bool(both.fullmatch(s["message"])), "the silence"
+        )
+        assert silent["level"] == "1"
+
+        def flexor_alone_is_missed() -> bool:
+            peer.say("emg_extensor", convert.float64_bytes(0.0))
+            peer.spin(0.05)
+            message = peer.status("emg_reference")["message"]
+            return message.startswith("no emg/flexor for ") and "emg/extensor" not in message
+
+        peer.until(flexor_alone_is_missed, what="the silence of one channel")
     assert values(peer, "reference_position") == expected
     assert status["rejected_samples"] == "1"
     assert expected[-1] > 0.5

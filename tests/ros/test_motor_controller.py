@@ -373,6 +373,40 @@ def test_real_time_goes_to_zero_volt_when_the_state_stops(peer):
         assert voltages(peer)[-1] == 0.0
 
 
+def test_real_time_warns_of_a_reference_that_has_stopped(peer):
+    peer.hear_diagnostics()
+    with processes(NodeProcess(NAME, clock="realtime", pause_limit_ms=10000, state_timeout_ms=10000)):
+        announce(peer)
+        peer.say("reference_position", convert.float64_bytes(5.0))
+
+        def says(start: str, reference: bool = False) -> bool:
+            peer.say("encoder_position", state_bytes(peer.node.get_clock().now().nanoseconds, 1.0))
+            peer.say("motor_current", convert.float64_bytes(0.1))
+            if reference:
+                peer.say("reference_position", convert.float64_bytes(5.0))
+            peer.spin(0.02)
+            return bool(status := peer.status(NAME)) and status["message"].startswith(start)
+
+        peer.until(lambda: says("no reference_position for "), what="the warning")
+        assert " s: the last one is held" in peer.status(NAME)["message"]
+        assert (
+            peer.status(NAME)["level"] != "0"
+        )  # an error where a busy machine kept the loop from running, too
+        peer.until(lambda: says("running", reference=True), what="the reference again")
+
+
+def test_lockstep_warns_of_a_tick_that_misses_its_reference(peer):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    with processes(NodeProcess(NAME, clock="lockstep")):
+        announce(peer)
+        peer.say("motor_current", convert.float64_bytes(0.0))
+        peer.say("encoder_position", state_bytes(0, 0.0))
+        peer.until_status(
+            NAME, lambda s: (s["message"], s["level"]) == ("waiting for reference_position", "1")
+        )
+
+
 def test_hannes_motor_switches_a_running_controller(peer):
     def motor(*words: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "hannes_bringup.cli", "motor", "--json", "--timeout", "60", *words]

@@ -18,6 +18,7 @@ from hannes_sim.rollout import rollout
 from hannes_stiffness.classifier import NOT_SURE, StiffnessClassifier, class_label
 from hannes_stiffness.features import extract
 from patience import PATIENCE
+from rclpy.duration import Duration
 
 pytestmark = pytest.mark.ros
 
@@ -84,7 +85,10 @@ class Bench:
 
     def _healthy(self, message):
         for status in message.status:
-            self.health = {v.key: v.value for v in status.values} | {"message": status.message}
+            self.health = {v.key: v.value for v in status.values} | {
+                "message": status.message,
+                "level": status.level[0],
+            }
 
     def wait(self, condition):
         end = time.monotonic() + PATIENCE
@@ -211,6 +215,24 @@ def test_in_real_time_it_survives_bad_values_gaps_and_a_restart(bench, closure):
     assert it.health["classifier_sha256"] == StiffnessClassifier.load().manifest["onnx"]["sha256"][:12]
     code, output = it.end(signal.SIGTERM)
     assert code == 0, output
+    assert "Traceback" not in output
+
+
+def test_a_second_source_is_an_error_and_ends_a_lockstep_that_waits_for_what_it_is_ahead_of(bench):
+    it = bench("clock:=lockstep")
+    second = topics.publisher(it.node, "reference_position")
+    it.wait(lambda: it.health["message"] == "2 publishers of reference_position; end all but one")
+    assert it.health["level"] == 2
+    for _ in range(82):
+        for _ in range(50):
+            second.publish(convert.float64_bytes(1.0))
+        # All at once is more than the topic holds.
+        if it.process.poll() is None:
+            second.wait_for_all_acked(Duration(seconds=1))
+    output = it.process.communicate(timeout=PATIENCE)[0]
+    assert it.process.returncode == 2
+    last = output.splitlines()[-1]
+    assert "reference_position has more messages than the ticks need, and 2 publishers." in last
     assert "Traceback" not in output
 
 

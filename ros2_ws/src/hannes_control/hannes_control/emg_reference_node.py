@@ -6,22 +6,28 @@ import math
 import sys
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from time import monotonic
 
 import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 from hannes_description.errors import HannesError
 from hannes_ros import convert, topics
-from hannes_ros.diagnostics import OK, WARN, Diagnostics, Health
-from hannes_ros.lockstep import Peers, samples_until
+from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health, silence
+from hannes_ros.lockstep import Peers, Probe, samples_until
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
+from hannes_ros.sources import Sources
 from rclpy.node import Node
 
 from .emg import EmgIntegrator, EmgParameters
 
 _CHECK_S = 0.02
 _DEFAULT = EmgParameters()
+_CHANNELS = ("emg_flexor", "emg_extensor")
+_TOPICS = tuple(topics.signal(name).topic for name in _CHANNELS)
+_LONGEST_QUEUE = 1000
+"""Samples of a channel that wait for the other channel or their tick, at most; its topic holds fewer."""
 
 
 @dataclass(frozen=True)
@@ -87,13 +93,17 @@ class EmgReferenceNode(HannesNode, Node):
         super().__init__(self.node_name, namespace=DEFAULT_NAMESPACE, cli_args=cli_args)
         self._p = p = declare(self, EmgReferenceParameters)
         self._emg = EmgIntegrator(p.emg())
-        self._channels: tuple[deque[float], deque[float]] = (deque(), deque())
+        self._channels: tuple[deque[float], deque[float]] = (
+            deque(maxlen=_LONGEST_QUEUE),
+            deque(maxlen=_LONGEST_QUEUE),
+        )
         self._held = [0.0, 0.0]
+        self._heard: dict[str, float] = {}
         self._taken = 0
         self._stamp = -1
-        self._ticks: deque[int] = deque()
+        self._ticks: deque[int] = deque(maxlen=_LONGEST_QUEUE)
         self._switches = 0
-        self._health = Health("rejected_samples", "rejected_states")
+        self._health = Health("rejected_samples", "rejected_states", "dropped_samples")
         self._reference = topics.publisher(self, "reference_position")
         self._lockstep = p.clock == "lockstep"
         self._peers = Peers(
@@ -104,8 +114,10 @@ class EmgReferenceNode(HannesNode, Node):
                 )
             }
         )
-        topics.subscription(self, "emg_flexor", lambda data: self._on_emg(0, data))
-        topics.subscription(self, "emg_extensor", lambda data: self._on_emg(1, data))
+        self._sources = Sources(self, *_CHANNELS, *(("encoder_position",) if self._lockstep else ()))
+        self._probe = Probe(self._sources.mixed)
+        for number, name in enumerate(_CHANNELS):
+            topics.subscription(self, name, partial(self._on_emg, number), self._probe.on_match)
         if self._lockstep:
             topics.subscription(self, "encoder_position", self._on_tick_state)
             self.wall_timer(_CHECK_S, self._check)
@@ -118,7 +130,7 @@ class EmgReferenceNode(HannesNode, Node):
         else:
             self._health.count("rejected_samples")
         self._channels[number].append(self._held[number])
-        self._health.last_input = monotonic()
+        self._heard[_TOPICS[number]] = self._health.last_input = monotonic()
         if self._lockstep:
             self._answer()
         elif all(self._channels):
@@ -164,10 +176,33 @@ class EmgReferenceNode(HannesNode, Node):
                 self._take()
             if self._taken < needed:
                 return
+            if self._probe.holds():
+                return
             self._ticks.popleft()
             self._publish()
 
+    def _on_surplus(self, name: str) -> None:
+        """Samples of another source end the node; those of one source that began again went by and are dropped."""
+        if self._sources.count(name) > 1:
+            self.fail(self._sources.surplus(name))
+            return
+        dropped = sum(map(len, self._channels))
+        self._health.count("dropped_samples", dropped)
+        for channel in self._channels:
+            channel.clear()
+        self.get_logger().warning(
+            f"{topics.signal(name).topic} is ahead of the ticks: {dropped} samples are dropped",
+            throttle_duration_sec=5.0,
+        )
+
     def _check(self) -> None:
+        if self._probe.over():
+            # The samples of the next tick come after its reading, which comes after the answer to this one.
+            left_over = [name for name, channel in zip(_CHANNELS, self._channels, strict=True) if channel]
+            if left_over:
+                self._on_surplus(left_over[0])
+            if not self.done:
+                self._answer()
         if not self._peers.complete and not self._peers.missing():
             self._answer()
 
@@ -177,10 +212,16 @@ class EmgReferenceNode(HannesNode, Node):
             "switch_events": self._switches,
             "samples": self._taken,
         }
+        if several := self._sources.several():
+            return ERROR, several, values
         if self._lockstep and (missing := self._peers.missing()):
             return WARN, f"waiting for {', '.join(missing)}", values
-        if self._health.last_input is None:
-            return WARN, "waiting for emg/flexor and emg/extensor", values
+        absent = [topic for topic in _TOPICS if topic not in self._heard]
+        if absent:
+            return WARN, f"waiting for {' and '.join(absent)}", values
+        # In lock-step there is nothing to hear while no tick waits for it.
+        if (self._ticks or not self._lockstep) and (silent := silence({t: self._heard[t] for t in _TOPICS})):
+            return WARN, f"{silent}: the reference stands", values
         if self._ticks:
             return OK, "waiting for EMG samples", values
         return OK, "running", values

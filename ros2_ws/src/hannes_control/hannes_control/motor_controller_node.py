@@ -12,12 +12,13 @@ from hannes_description.errors import HannesError
 from hannes_description.joints import RAD_PER_COUNT
 from hannes_description.model import Model
 from hannes_ros import convert, topics
-from hannes_ros.diagnostics import ERROR, OK, WARN, Arrivals, Diagnostics, Health
-from hannes_ros.lockstep import SETTLE_S, Peers, TickJoin
+from hannes_ros.diagnostics import ERROR, OK, WARN, Arrivals, Diagnostics, Health, silence
+from hannes_ros.lockstep import SETTLE_S, Peers, Probe, TickJoin
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
+from hannes_ros.sources import Sources
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
@@ -107,7 +108,13 @@ class MotorController(HannesNode, LifecycleNode):
         self._lockstep = p.clock == "lockstep"
         self._active = self._tripped = False
         self._health = Health(
-            "rejected_states", "rejected_inputs", "limited_references", "state_timeouts", "trips", "resets"
+            "rejected_states",
+            "rejected_inputs",
+            "limited_references",
+            "state_timeouts",
+            "trips",
+            "resets",
+            "rejoins",
         )
         self._arrivals = Arrivals()
         self._state: convert.JointSample | None = None
@@ -122,19 +129,26 @@ class MotorController(HannesNode, LifecycleNode):
         self._loop: RealtimeLoop | None = None
         self._missed = 0
 
+        inputs = ("encoder_position", "motor_current", "reference_position")
+        self._sources = Sources(self, *inputs[: 3 if self._profile is None else 2])
+        self._probe = Probe(self._sources.mixed)
+        heard = self._probe.on_match
         self._voltage = topics.publisher(self, "motor_voltage")
         topics.subscription(
-            self, "motor_current", self._on_tick_current if self._lockstep else self._on_current
+            self, "motor_current", self._on_tick_current if self._lockstep else self._on_current, heard
         )
         # who records wants the reference on its topic, wherever it comes from
         self._own_reference = None if self._profile is None else topics.publisher(self, "reference_position")
         if self._profile is None:
             topics.subscription(
-                self, "reference_position", self._on_tick_reference if self._lockstep else self._on_reference
+                self,
+                "reference_position",
+                self._on_tick_reference if self._lockstep else self._on_reference,
+                heard,
             )
         # Last: hand_sim starts once it has found who hears this, who then hears the rest too.
         topics.subscription(
-            self, "encoder_position", self._on_tick_state if self._lockstep else self._on_state
+            self, "encoder_position", self._on_tick_state if self._lockstep else self._on_state, heard
         )
         self._peers = Peers(
             {
@@ -345,6 +359,11 @@ class MotorController(HannesNode, LifecycleNode):
         if sample is None:
             return
         self._health.faults.good("motor/state")
+        jumps = 0 <= self._heard < sample.stamp_ns - self._period_ns
+        if (jumps or (self._probe.held and sample.stamp_ns != self._heard)) and self._sources.mixed():
+            # No simulator leaves out ticks, or begins again while its tick is held.
+            self.fail(self._sources.surplus("encoder_position"))
+            return
         if sample.stamp_ns < self._answered:  # the simulator began again
             self._join.reset()
             self._answered = self._heard = -1
@@ -367,10 +386,28 @@ class MotorController(HannesNode, LifecycleNode):
         self._join.put(slot, item)
         if self._join.synchronised:
             self._answer()
+        if self._join.surplus is not None:
+            self._on_surplus(self._join.surplus)
+
+    def _on_surplus(self, slot: int) -> None:
+        """Messages of another source end the node; what one source repeated too late for `rejoin` is joined anew."""
+        name = ("encoder_position", "motor_current", "reference_position")[slot]
+        if slot == 0 and self._join.synchronised:
+            name = "motor_voltage"  # somebody else has answered, or the next motor/state would not be there
+        if not self._join.synchronised or self._sources.count(name) > 1:
+            self.fail(self._sources.surplus(name))
+            return
+        self._health.count("rejoins")
+        self.get_logger().warning(f"{topics.signal(name).topic} is ahead of the ticks: joined anew")
+        self._join.rejoin()
 
     def _answer(self) -> None:
         """Answer the tick if all of it is here, the motor is on and the answer will be heard."""
-        while self._active and self._peers.complete and (tick := self._join.take()) is not None:
+        while self._active and self._peers.complete and self._join.complete:
+            if self._join.synchronised and self._probe.holds():
+                return
+            tick = self._join.take()
+            assert tick is not None
             sample, current = tick[0], tick[1]
             if sample.stamp_ns == self._answered:
                 continue
@@ -378,14 +415,17 @@ class MotorController(HannesNode, LifecycleNode):
             if self._answered >= 0 and step_ns != self._period_ns:
                 self.fail(
                     f"motor/state comes every {step_ns * 1e-9:g} s, but the control period is "
-                    f"{self._p.period:g} s; give hand_sim and motor_controller the same period."
+                    f"{self._p.period:g} s; give hand_sim and motor_controller the same period"
+                    + (f" ({several})." if (several := self._sources.several()) else ".")
                 )
                 return
             reference = (
                 tick[2] if self._profile is None else self._profile_at(sample.stamp_ns // self._period_ns)
             )
             self._answered = sample.stamp_ns
-            self._join.synchronise()
+            if not self._join.synchronised:
+                self._join.synchronise()
+                self._probe.due = True
             self._health.cycles += 1
             self._voltage.publish(
                 convert.float64_bytes(self._command(reference, sample.position[0], current))
@@ -393,6 +433,11 @@ class MotorController(HannesNode, LifecycleNode):
 
     # -- health ------------------------------------------------------------------------------------------------------
     def _check(self) -> None:
+        if self._lockstep and self._probe.over() and self._join.synchronised:
+            if (left_over := self._join.left_over) is not None:
+                self._on_surplus(left_over)
+            else:
+                self._answer()
         if (
             self._lockstep
             and not self._peers.missing()
@@ -433,6 +478,8 @@ class MotorController(HannesNode, LifecycleNode):
             "reference_age_s": age,
             "state_rate_hz": self._state_rate(),
         }
+        if several := self._sources.several():
+            return ERROR, several, values
         if not self._active:
             return WARN, "not active: motor off" + ("; activate again" if self._tripped else ""), values
         if self._lockstep and (absent := self._peers.missing()):
@@ -440,7 +487,10 @@ class MotorController(HannesNode, LifecycleNode):
         names = ("motor/state", "motor/current", "reference_position")
         if self._lockstep:
             missing = [names[slot] for slot in self._join.missing()]
-            return OK, f"waiting for {', '.join(missing)}" if missing else "running", values
+            level = WARN if self._state_at and silence({"any message": self._state_at}) else OK
+            return (
+                (level, f"waiting for {', '.join(missing)}", values) if missing else (OK, "running", values)
+            )
         if self._stale:
             return ERROR, "motor/state or motor/current is too old: 0 V", values
         absent = [
@@ -452,7 +502,11 @@ class MotorController(HannesNode, LifecycleNode):
             )
             if value is None and name not in self._health.faults
         ]
-        return (WARN, f"waiting for {', '.join(absent)}", values) if absent else (OK, "running", values)
+        if absent:
+            return WARN, f"waiting for {', '.join(absent)}", values
+        if self._profile is None and (silent := silence({"reference_position": self._reference_at})):
+            return WARN, f"{silent}: the last one is held", values
+        return OK, "running", values
 
 
 def main() -> None:

@@ -26,6 +26,20 @@ OK, WARN, ERROR, STALE = (
 MISSED_WARN, MISSED_ERROR = 0.01, 0.1
 """Share of missed cycles from which a node warns, and from which it reports an error."""
 
+SILENT_S = 1.0
+"""s of wall time without a message after which an input that was there counts as stopped: 100 samples of the slowest
+EMG, and more than a busy machine keeps a node waiting. A reference that stands still is published all the same."""
+
+
+def silence(heard: Mapping[str, float]) -> str | None:
+    """Which inputs have stopped, and for how long; None if none has.
+
+    heard  topic -> time of its latest message, s of `time.monotonic`
+    """
+    now = monotonic()
+    stopped = [f"{topic} for {now - at:.1f} s" for topic, at in heard.items() if now - at > SILENT_S]
+    return f"no {', no '.join(stopped)}" if stopped else None
+
 
 SAY_AGAIN_S = 5.0
 """s of wall time between two lines of log about the same fault."""

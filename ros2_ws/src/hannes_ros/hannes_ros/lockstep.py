@@ -9,12 +9,17 @@ n-th reference that a node receives therefore belong together (`TickJoin`).
 Who comes late has not seen all of them. While hand_sim stands still and a newcomer is there, it repeats the reading
 (`StallWatch`), and emg_reference repeats its answer. Repeated messages break the pairing by order, so a node that
 starts, or sees a stamp again, pairs the newest of each topic, once none has come for SETTLE_S; then by order again.
+
+No message can be ahead of the tick that is being answered: the next reading comes after its command. What is left over
+from a tick, and is no repetition, is therefore of another source, and from there on each message of its topic meets the
+tick after its own. `Probe` looks for that.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from time import monotonic
 from typing import Any
 
 _GIGA = 1_000_000_000
@@ -33,22 +38,77 @@ def samples_until(stamp_ns: int, rate: int) -> int:
     return stamp_ns * rate // _GIGA + 1
 
 
+class Probe:
+    """Says when a tick is held for HOLD_S before it is answered, so that a message too many shows.
+
+    On a running graph it does not show: the tick that meets the message too many is answered at once, and each later
+    message meets the tick after its own. While a tick is held, its own message comes too, and is left over.
+    A tick is held when a second source comes or one goes, and each REPEAT_S while there are several.
+
+    several  whether an input has several publishers
+    """
+
+    HOLD_S = 0.02
+    REPEAT_S = 1.0
+
+    def __init__(self, several: Callable[[], bool]) -> None:
+        self._several = several
+        self._since: float | None = None
+        self._asked = 0.0
+        self.due = False
+
+    def on_match(self, status: Any) -> None:
+        """A publisher of an input was found or lost."""
+        self.due = self.due or status.current_count > 1 or status.current_count_change < 0
+
+    @property
+    def held(self) -> bool:
+        """Whether a tick is held."""
+        return self._since is not None
+
+    def holds(self) -> bool:
+        """A tick is complete: whether its answer has to wait for `over`."""
+        if self._since is None and self.due:
+            self.due, self._since = False, monotonic()
+        return self.held
+
+    def over(self) -> bool:
+        """Called often: whether a held tick is to be looked at, and answered, now."""
+        now = monotonic()
+        if self._since is not None:
+            if now - self._since < self.HOLD_S:
+                return False
+            self._since = None
+            return True
+        if now - self._asked >= self.REPEAT_S:
+            self._asked = now
+            self.due = self.due or self._several()
+        return False
+
+
 class TickJoin:
     """Joins the messages of one tick from several topics by their order.
 
-    slots  number of topics; slot 0 is the one with the stamp
+    slots    number of topics; slot 0 is the one with the stamp
+    longest  so many messages a slot may hold, or be ahead of another while the newest are paired
+    surplus  a slot that held more; None if there is none
     Until `synchronise` is called (at the first answer) each slot keeps only its newest message, because a newcomer
     may have missed older ones; from then on the n-th message of each slot belongs to the n-th of the others.
     """
 
-    def __init__(self, slots: int) -> None:
-        self._slots = slots
+    def __init__(self, slots: int, longest: int = 200) -> None:
+        self._slots, self._longest = slots, longest
         self._queues: list[deque[Any]] = []
+        self._came: list[int] = []
+        self.surplus: int | None = None
         self.reset()
 
     def reset(self) -> None:
         """Forget everything; pair the newest again."""
-        self._queues = [deque(maxlen=1) for _ in range(self._slots)]
+        self._begin([deque(maxlen=1) for _ in range(self._slots)])
+
+    def _begin(self, queues: list[deque[Any]]) -> None:
+        self._queues, self._came, self.surplus = queues, [0] * self._slots, None
 
     @property
     def synchronised(self) -> bool:
@@ -57,22 +117,38 @@ class TickJoin:
 
     def rejoin(self) -> None:
         """Messages were repeated: keep the newest of each, and pair the newest until `synchronise`."""
-        self._queues = [deque(queue, maxlen=1) for queue in self._queues]
+        self._begin([deque(queue, maxlen=1) for queue in self._queues])
 
     def synchronise(self) -> None:
         """From here on pair strictly by order."""
         if not self.synchronised:
-            self._queues = [deque(queue) for queue in self._queues]
+            self._begin([deque(queue) for queue in self._queues])
 
     def put(self, slot: int, item: Any) -> None:
         """A message of that slot."""
         self._queues[slot].append(item)
+        self._came[slot] += 1
+        others = 0 if self.synchronised else min(self._came)
+        if self._came[slot] - others > self._longest:
+            self.surplus = slot
+
+    @property
+    def complete(self) -> bool:
+        """Whether there is a message of each slot."""
+        return all(self._queues)
+
+    @property
+    def left_over(self) -> int | None:
+        """A slot with more messages than the complete tick needs."""
+        return next((slot for slot, queue in enumerate(self._queues) if len(queue) > 1), None)
 
     def take(self) -> list[Any] | None:
         """One message of each slot, or None while one is missing."""
-        if all(self._queues):
-            return [queue.popleft() for queue in self._queues]
-        return None
+        if not self.complete:
+            return None
+        tick = [queue.popleft() for queue in self._queues]
+        self._came = [len(queue) for queue in self._queues]
+        return tick
 
     def missing(self) -> list[int]:
         """Slots without a message, while another slot has one."""

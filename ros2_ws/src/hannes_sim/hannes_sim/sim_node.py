@@ -13,11 +13,12 @@ from hannes_description.model import Model
 from hannes_ros import convert, topics
 from hannes_ros.command import CommandGate
 from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
-from hannes_ros.lockstep import Peers, StallWatch, stamp_of_tick
+from hannes_ros.lockstep import Peers, Probe, StallWatch, stamp_of_tick
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
+from hannes_ros.sources import Sources
 from rclpy.node import Node
 
 from .factory import make_plant
@@ -123,7 +124,10 @@ class HandSim(HannesNode, Node):
         self._force = topics.publisher(self, "grip_force")
         self._last: tuple[bytes, bytes] = (b"", b"")
         on_voltage = self._on_tick_voltage if self._lockstep else self._on_voltage
-        self._voltage = topics.subscription(self, "motor_voltage", on_voltage)
+        self._sources = Sources(self, "motor_voltage", rule="only one may drive the motor")
+        self._probe = Probe(self._sources.mixed)
+        self._held: float | None = None
+        topics.subscription(self, "motor_voltage", on_voltage, self._probe.on_match)
         self._peers = Peers(
             {
                 "a publisher of motor/voltage": (self._voltage_publishers, 1),
@@ -200,8 +204,8 @@ class HandSim(HannesNode, Node):
             "command_timeouts": gate.timeouts,
             "command_age_at_zero_s": age,
         }
-        if (drivers := self._voltage_publishers()) > 1:
-            return ERROR, f"{drivers} publishers of motor/voltage; only one may drive the motor", values
+        if several := self._sources.several():
+            return ERROR, several, values
         if not self._lockstep:
             values["applied_voltage"] = f"{self._applied:.6g}"
             if gate.last_command is None:
@@ -244,7 +248,7 @@ class HandSim(HannesNode, Node):
         self._clock_heard = status.current_count > 0  # type: ignore[attr-defined]
 
     def _voltage_publishers(self) -> int:
-        return self.count_publishers(self._voltage.topic_name)
+        return self._sources.count("motor_voltage")
 
     def _publish_tick(self) -> None:
         stamp_ns = stamp_of_tick(self._tick, self._period_ns)
@@ -258,8 +262,18 @@ class HandSim(HannesNode, Node):
         if not self._waiting:
             self._health.count("unexpected_commands")
             return
+        if self._held is not None:
+            self.fail(self._sources.surplus("motor_voltage"))
+            return
+        voltage = convert.float64_value(data)
+        if self._probe.holds():
+            self._held = voltage
+            return
+        self._take(voltage)
+
+    def _take(self, voltage: float) -> None:
         self._waiting = False
-        if self._advance(self._gate.command(convert.float64_value(data), monotonic()), 1):
+        if self._advance(self._gate.command(voltage, monotonic()), 1):
             self._publish_tick()
 
     def _check_lockstep(self) -> None:
@@ -274,7 +288,12 @@ class HandSim(HannesNode, Node):
                 self._began = monotonic()
                 self._publish_tick()
             return
-        if not self._waiting:
+        if self.done or not self._waiting:
+            return
+        if self._probe.over() and self._held is not None:
+            voltage, self._held = self._held, None
+            self._take(voltage)
+        if self._held is not None:
             return
         before = self._watch.stalls
         if self._watch.check(monotonic()):

@@ -14,11 +14,12 @@ from time import monotonic
 
 from hannes_description.errors import HannesError
 from hannes_ros.convert import MOTOR_STATE, JointSample, float64_bytes, float64_value
-from hannes_ros.diagnostics import OK, WARN, Diagnostics, Health
+from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
 from hannes_ros.lockstep import TickJoin
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
+from hannes_ros.sources import Sources
 from hannes_ros.topics import publisher, subscription
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray, String
@@ -27,6 +28,7 @@ from .classifier import NOT_SURE, StiffnessClassifier, class_label
 from .features import FeatureStream, Sample, believable
 
 _STATE, _CURRENT, _REFERENCE = range(3)
+_INPUTS = ("encoder_position", "motor_current", "reference_position")
 _LONGEST_QUEUE = 4000
 """Messages without a whole tick after which lock-step is joined anew; most currents kept between two states.
 
@@ -69,7 +71,7 @@ class StiffnessNode(HannesNode, Node):
         self._health = Health("not_finite", "unknown_joint", "stale_input", "lost_ticks", "not_sure")
         self._latest: dict[int, tuple[float, float]] = {}
         self._currents: list[float] = []
-        self._join = TickJoin(3)
+        self._join = TickJoin(3, _LONGEST_QUEUE)
         # From the first message on, since nothing waits for this node: it may have missed the first ticks, but then of
         # all topics alike.
         self._join.synchronise()
@@ -88,6 +90,7 @@ class StiffnessNode(HannesNode, Node):
         subscription(self, "motor_current", lambda data: self._number(_CURRENT, data))
         subscription(self, "reference_position", lambda data: self._number(_REFERENCE, data))
         subscription(self, "encoder_position", self._state)
+        self._sources = Sources(self, *_INPUTS)
         self._diagnostics = Diagnostics(self, self._health, self._report)
 
     def _number(self, slot: int, data: bytes) -> None:
@@ -152,7 +155,9 @@ class StiffnessNode(HannesNode, Node):
         if taken is not None:
             self._queued = 0
             self._classify(*taken)
-        elif self._queued > _LONGEST_QUEUE:
+        if (ahead := self._join.surplus) is not None and self._sources.count(_INPUTS[ahead]) > 1:
+            self.fail(self._sources.surplus(_INPUTS[ahead]))
+        elif ahead is not None or self._queued > _LONGEST_QUEUE:
             self._rejoin()
 
     def _classify(self, state: JointSample, current: float, reference: float) -> None:
@@ -190,6 +195,8 @@ class StiffnessNode(HannesNode, Node):
             "restarts": self._stream.restarts,
             "classifier_sha256": self._classifier.manifest["onnx"]["sha256"][:12],
         }
+        if several := self._sources.several():
+            return ERROR, several, values
         if self._health.last_input is None:
             return WARN, "waiting for motor/state", values
         if self._settings.clock == "lockstep":

@@ -1,0 +1,49 @@
+"""Each topic has one source: who tells of a second one, whose messages mix with those of the first."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+
+from .topics import signal
+
+_LOG_S = 30.0
+
+
+class Sources:
+    """Counts the publishers of the inputs of a node.
+
+    names  signals that the node hears
+    rule   what holds for them, the end of the report
+    A node that was killed counts until the middleware forgets it, some 20 s later.
+    """
+
+    def __init__(self, node: Node, *names: str, rule: str = "end all but one") -> None:
+        self._node, self._names, self._rule = node, names, rule
+
+    def count(self, name: str) -> int:
+        """How many publishers the topic of that signal has."""
+        return self._node.count_publishers(self._node.resolve_topic_name(signal(name).topic))
+
+    def mixed(self) -> bool:
+        """Whether an input has more than one publisher."""
+        return any(self.count(name) > 1 for name in self._names)
+
+    def several(self) -> str | None:
+        """What to report of inputs with more than one publisher, logged too; None where each has one at most."""
+        counts = {name: self.count(name) for name in self._names}
+        mixed = [f"{n} publishers of {signal(name).topic}" for name, n in counts.items() if n > 1]
+        if not mixed:
+            return None
+        text = f"{', '.join(mixed)}; {self._rule}"
+        self._node.get_logger().error(text, throttle_duration_sec=_LOG_S)
+        return text
+
+    def surplus(self, name: str) -> str:
+        """The error of a lock-step whose messages no longer belong together, because of that signal's topic."""
+        count = self.count(name)
+        return (
+            f"{signal(name).topic} has more messages than the ticks need, and {count} "
+            f"publisher{'' if count == 1 else 's'}. In lock-step it has one, which answers each tick once: end the "
+            "others (a bag that is played, ros2 topic pub, a second graph; a node that was killed counts for 20 s), "
+            "give every node clock:=lockstep and the same rate and period, and start the graph again."
+        )
