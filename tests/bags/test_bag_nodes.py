@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import struct
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +73,24 @@ def settle(condition: Callable[[], bool], timeout: float = PATIENCE) -> None:
     while not condition():
         assert time.monotonic() < limit, "it did not come to pass"
         time.sleep(0.01)
+
+
+def says(child: subprocess.Popen[str], text: str) -> None:
+    """Wait until the node prints the text."""
+    assert child.stdout is not None
+    file, said = child.stdout.fileno(), b""
+    os.set_blocking(file, False)
+
+    def heard() -> bool:
+        nonlocal said
+        with suppress(BlockingIOError):
+            said += os.read(file, 65536)
+        return text.encode() in said
+
+    try:
+        settle(heard)
+    finally:
+        os.set_blocking(file, True)
 
 
 def written(bag: Path) -> bytes:
@@ -299,10 +319,9 @@ def test_who_publishes_what_is_being_played_is_said(start: Start, tmp_path: Path
 
     bag = str(write_recording(recording(n=50, names=("grip_force",)), tmp_path / "bag"))
     child = start("player", bag=bag, subscribers=1, wait=PATIENCE, loop=True)
-    assert child.stdout is not None
-    settle(lambda: "playing" in child.stdout.readline())  # type: ignore[union-attr]
+    says(child, "playing")
     topics.publisher(driver, "grip_force")
-    settle(lambda: "/hannes/grip_force by /hannes/motor_controller" in child.stdout.readline())  # type: ignore[union-attr]
+    says(child, "/hannes/grip_force by /hannes/motor_controller")
     assert "played " in end(child, signal.SIGINT)
 
 

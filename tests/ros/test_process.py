@@ -101,8 +101,8 @@ def test_early_signals_end_quietly(ros_environment, delay):
     ],
 )
 def test_mistakes_are_one_line_and_exit_code_2(ros_environment, name, arguments, parameters, message):
-    node = NodeProcess(name, *arguments, **parameters)
-    assert node.wait() == 2, node.output
+    with processes(NodeProcess(name, *arguments, **parameters)) as (node,):
+        assert node.wait() == 2, node.output
     assert message in node.output
     assert "Traceback" not in node.output
     assert len([line for line in node.lines if "[rcl]" not in line]) == 1, node.output
@@ -128,8 +128,8 @@ def test_help_says_which_section_of_a_file_is_read(peer, tmp_path):
     assert len(sections) == 2
     for section in sections:
         file.write_text(f"{section}: {{ros__parameters: {{object: ball}}}}\n")
-        node = NodeProcess("hand_sim", "--ros-args", "--params-file", str(file))
-        assert node.wait() == 2 and "is 'ball'; valid are none, soft, rigid" in node.output
+        with processes(NodeProcess("hand_sim", "--ros-args", "--params-file", str(file))) as (node,):
+            assert node.wait() == 2 and "is 'ball'; valid are none, soft, rigid" in node.output
 
 
 def test_a_topic_is_renamed_in_the_old_way_too(peer):

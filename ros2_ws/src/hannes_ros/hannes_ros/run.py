@@ -225,8 +225,8 @@ def _help(program: str, classes: Sequence[Any]) -> None:
     node = classes[0].node_name
     print(f"usage: {program} [--ros-args -p name:=value -r old:=new --params-file FILE.yaml ...]")
     print(
-        f"FILE.yaml has a section '/{DEFAULT_NAMESPACE}/{node}:' (or '/**/{node}:', in any namespace) with "
-        "'ros__parameters:' in it;\na section of another name is not read."
+        f"FILE.yaml has a section '/{DEFAULT_NAMESPACE}/{node}:' (or '/**/{node}:' in any namespace, '/**:' for all "
+        f"nodes)\nwith 'ros__parameters:' in it; a section of another name, such as '{node}:', is not read."
     )
     for cls in classes:
         title = (cls.__doc__ or "").strip().split("\n")[0]
