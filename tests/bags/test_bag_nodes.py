@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import struct
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from bags.bag_samples import MOTOR, recording
+from bags.bag_samples import MOTOR, foreign_bag, motor_messages, recording
 from hannes_bags.reading import bag_info, read_bag
 from hannes_bags.recover import recover
 from hannes_bags.writing import write_recording
@@ -71,6 +73,24 @@ def settle(condition: Callable[[], bool], timeout: float = PATIENCE) -> None:
     while not condition():
         assert time.monotonic() < limit, "it did not come to pass"
         time.sleep(0.01)
+
+
+def says(child: subprocess.Popen[str], text: str) -> None:
+    """Wait until the node prints the text."""
+    assert child.stdout is not None
+    file, said = child.stdout.fileno(), b""
+    os.set_blocking(file, False)
+
+    def heard() -> bool:
+        nonlocal said
+        with suppress(BlockingIOError):
+            said += os.read(file, 65536)
+        return text.encode() in said
+
+    try:
+        settle(heard)
+    finally:
+        os.set_blocking(file, True)
 
 
 def written(bag: Path) -> bytes:
@@ -259,3 +279,56 @@ def test_the_player_says_who_is_missing(start: Start, tmp_path: Path) -> None:
     child = start("player", bag=str(bag), subscribers=1, wait=0.2)
     output, _ = child.communicate(timeout=PATIENCE)
     assert child.returncode == 2 and "not 1 subscribers of /hannes/grip_force" in output
+
+
+@pytest.fixture
+def driver(ros_context: Any) -> Iterator[Any]:
+    """A motor_controller's topics: it publishes motor/voltage, and hears it and the grip force."""
+    from hannes_ros import topics
+
+    node, _ = publisher(ros_context, "motor_controller")
+    for name in ("motor_voltage", "grip_force"):
+        topics.subscription(node, name, lambda data: None)
+    yield node
+    node.destroy_node()
+
+
+def test_a_bag_is_not_played_where_another_node_publishes(start: Start, tmp_path: Path, driver: Any) -> None:
+    """The bag's voltage would drive the motor beside the controller, or after it is switched off."""
+    bag = str(write_recording(recording(n=50, names=(*MOTOR, "grip_force")), tmp_path / "bag"))
+    voltage = ["/hannes/motor/voltage"]
+    said = refused(start("player", bag=bag, topics=voltage, subscribers=1, wait=PATIENCE))
+    assert "/hannes/motor/voltage by /hannes/motor_controller" in said
+    assert "--topic" in said and "beside:=true" in said
+    for wanted in ({"topics": ["/hannes/grip_force"]}, {"topics": voltage, "beside": True}):
+        assert "played " in end(start("player", bag=bag, subscribers=1, wait=PATIENCE, **wanted))
+
+
+def test_time_is_told_by_one_node(start: Start, tmp_path: Path, driver: Any) -> None:
+    from hannes_ros import topics
+
+    bag = str(write_recording(recording(n=50, names=("grip_force",)), tmp_path / "bag"))
+    topics.clock_publisher(driver)
+    said = refused(start("player", bag=bag, subscribers=1, wait=PATIENCE))
+    assert "/clock by /hannes/motor_controller" in said and "clock:=false" in said
+    end(start("player", bag=bag, subscribers=1, wait=PATIENCE, clock=False))
+
+
+def test_who_publishes_what_is_being_played_is_said(start: Start, tmp_path: Path, driver: Any) -> None:
+    from hannes_ros import topics
+
+    bag = str(write_recording(recording(n=50, names=("grip_force",)), tmp_path / "bag"))
+    child = start("player", bag=bag, subscribers=1, wait=PATIENCE, loop=True)
+    says(child, "playing")
+    topics.publisher(driver, "grip_force")
+    says(child, "/hannes/grip_force by /hannes/motor_controller")
+    assert "played " in end(child, signal.SIGINT)
+
+
+def test_old_health_is_played_only_by_its_name(start: Start, tmp_path: Path) -> None:
+    messages = motor_messages(np.arange(1, 11, dtype=np.int64) * 1_000_000)
+    empty = b"\x00\x01\x00\x00" + bytes(12) + b"\x01" + bytes(3) + bytes(4)
+    messages["/diagnostics"] = ("diagnostic_msgs/msg/DiagnosticArray", [(5_000_000, empty)])
+    bag = str(foreign_bag(tmp_path / "bag", messages))
+    assert "played 20 messages" in end(start("player", bag=bag))
+    assert "played 1 messages" in end(start("player", bag=bag, topics=["/diagnostics"]))

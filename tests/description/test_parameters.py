@@ -1,5 +1,6 @@
 """Parameters with provenance, and model files: what is refused, and what comes back unchanged."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,9 @@ from hannes_sim.effect import load_effect
 from hannes_sim.factory import make_plant
 
 OTHER_UNIT = "{value: 10, unit: mN.m, lower: 0, upper: 100, status: assumed, source: x}"
+
+OTHER = "overrides: {%s: {value: %s, unit: %s, lower: -1, upper: 1, status: assumed, source: x}}"
+KT = "{value: %s, unit: N.m/A, lower: 0, upper: 2, status: assumed, source: x}"
 
 
 def test_every_shipped_number_has_unit_bounds_status_and_source() -> None:
@@ -49,6 +53,18 @@ def test_the_hash_tells_simulations_apart_not_names() -> None:
         ("schema: hannes/model/1\noverrides: {motor.resistence: {value: 1}}\n", r"motor\.resistance"),
         ("schema: hannes/model/1\noverrides: {motor.resistance: {value: 1}}\n", "missing keys"),
         (f"schema: hannes/model/1\noverrides: {{friction.coulomb: {OTHER_UNIT}}}\n", "must be in 'N.m'"),
+        (
+            f"schema: hannes/model/1\noverrides: {{motor.kt: {KT % 'true'}}}\n",
+            "value is True; it must be a number",
+        ),
+        (
+            f"schema: hannes/model/1\noverrides: {{motor.kt: {KT % repr('0.017')}}}\n",
+            "value is '0.017'; it must be",
+        ),
+        (
+            "schema: hannes/model/1\nplant: reduced\nplant: mujoco\n",
+            "line 3, column 1: the key 'plant' is given",
+        ),
         ("schema: hannes/model/1\nparameters: nobody\n", "shipped are"),
         ("schema: hannes/model/1\neffects: [{name: x}]\n", "every effect needs"),
         ("schema: [\n", "not valid YAML"),
@@ -109,6 +125,52 @@ def test_what_a_model_file_overrides_is_told_by_its_own_name(tmp_path: Path) -> 
         with pytest.raises(HannesError, match=r"armature is .* more than 0") as caught:
             make_plant(Model.load(file))
         assert str(caught.value).startswith(f"{file}: ")
+
+
+EFFECT = (
+    "effects: [{name: %s, parameters: {%s: "
+    "{value: 0.1, unit: %s, lower: 0, upper: 1, status: assumed, source: x}}}]"
+)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (EFFECT % ("coulomb_friction", "level", "mN.m"), "'coulomb_friction': level is in 'mN.m'; it must be in 'N.m'"),
+        (EFFECT % ("coulomb_friction", "level", "N"), "level is in 'N'; it must be in 'N.m'"),
+        (EFFECT % ("load_dependent_friction", "coefficient", "N"), "coefficient is in 'N'; it must be in '1'"),
+        (EFFECT % ("coulomb_friction", "level", "N.m"), ""),
+        (EFFECT % ("coulomb_friction", "level", "kg.m2/s2"), ""),
+        (OTHER % ("wire.stiffness", "-0.74", "N.m/rad"), "wire.stiffness is -0.74 N.m/rad; .* needs 0 or more"),
+        (OTHER % ("friction.coulomb", "-1e-3", "N.m"), "friction.coulomb is -0.001 N.m; .* needs 0 or more"),
+        (OTHER % ("motor.inductance", "1e-4", "H"), ""),
+        ("variant: {foo: 1}", "unknown options foo; valid are return_mechanism"),
+    ],
+)  # fmt: skip
+def test_what_a_plant_cannot_mean_is_refused(tmp_path: Path, more: str, message: str) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"schema: hannes/model/1\n{more}\n")
+    if not message:
+        make_plant(Model.load(file))
+        return
+    with pytest.raises(HannesError, match=message) as caught:
+        make_plant(Model.load(file))
+    assert str(caught.value).startswith(f"{file}: ") or "variant" in more
+
+
+def test_an_effect_on_a_linear_machine_is_in_newtons(tmp_path: Path) -> None:
+    base = tmp_path / "base.yaml"
+    shown = {name: p.to_dict() for name, p in load_parameters("hannes").items()}
+    shown["motor.armature"]["unit"] = "kg"
+    base.write_text(json.dumps(shown))
+    file = tmp_path / "mine.yaml"
+    for unit in ("N", "N.m", "mN"):
+        entry = EFFECT % ("coulomb_friction", "level", unit)
+        file.write_text(f"schema: hannes/model/1\nparameters: base.yaml\n{entry}\n")
+        if unit != "mN":
+            make_plant(Model.load(file))
+    with pytest.raises(HannesError, match="level is in 'mN'; it must be in 'N'"):
+        make_plant(Model.load(file))
 
 
 def test_unreadable_and_missing_files(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 from hannes_bringup.cli import main
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.units import linear_unit
 from hannes_lab.compare import Comparison, compare
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Fall
@@ -21,7 +22,7 @@ from hannes_lab.fit import Fit, fit
 from hannes_lab.greedy import _left_open
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import effect_coordinates
-from hannes_lab.rig import Nuisance, linear_unit, load_rig, scaled_effect, unit_factor
+from hannes_lab.rig import Nuisance, load_rig, scaled_effect, unit_factor
 from hannes_lab.screen import usable_effects
 from hannes_lab.search import Candidate, Search
 from hannes_lab.spectrum import position_periods

@@ -94,6 +94,17 @@ def test_model_show_says_where_every_number_comes_from() -> None:
     assert all(name in table.stdout for name in shown["parameters"])
 
 
+def test_an_effect_in_another_unit_is_not_shown(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    level = "{value: 30.0, unit: mN.m, lower: 0.0, upper: 100.0, status: assumed, source: x}"
+    file.write_text(
+        f"schema: hannes/model/1\neffects: [{{name: coulomb_friction, parameters: {{level: {level}}}}}]\n"
+    )
+    answer = hannes("model", "show", str(file))
+    assert (answer.returncode, answer.stdout) == (2, "")
+    assert f"{file}: effect 'coulomb_friction': level is in 'mN.m'; it must be in 'N.m'" in answer.stderr
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -77,7 +78,14 @@ def test_early_signals_end_quietly(ros_environment, delay):
         ("hand_sim", (), {"modle": "x"}, "Node 'hand_sim' has no parameter 'modle'; valid are model, plant,"),
         ("hand_sim", (), {"model": "nobody"}, "No model 'nobody'"),
         ("hand_sim", (), {"object_size": 0.05}, "need an object"),
-        ("hand_sim", (), {"period": 0.00033}, "not a multiple of the plant's step"),
+        ("hand_sim", (), {"period": 0.00009}, "it must be between 0.0001 and 0.1 s"),
+        ("hand_sim", ("object:=rigid",), {}, "give it as '--ros-args -p object:=rigid'"),
+        (
+            "emg_source",
+            ("--ros-args", "-p", "clock:=realtime", "--", "emg_source:seed:=1"),
+            {},
+            "'emg_source:seed:=1'",
+        ),
         (
             "motor_controller",
             (),
@@ -93,8 +101,8 @@ def test_early_signals_end_quietly(ros_environment, delay):
     ],
 )
 def test_mistakes_are_one_line_and_exit_code_2(ros_environment, name, arguments, parameters, message):
-    node = NodeProcess(name, *arguments, **parameters)
-    assert node.wait() == 2, node.output
+    with processes(NodeProcess(name, *arguments, **parameters)) as (node,):
+        assert node.wait() == 2, node.output
     assert message in node.output
     assert "Traceback" not in node.output
     assert len([line for line in node.lines if "[rcl]" not in line]) == 1, node.output
@@ -110,6 +118,31 @@ def test_help_lists_the_parameters(ros_environment):
         "envelope_cutoff",
     ):
         assert text in node.output
+
+
+def test_help_says_which_section_of_a_file_is_read(peer, tmp_path):
+    file = tmp_path / "parameters.yaml"
+    node = NodeProcess("hand_sim", "--help")
+    assert node.wait() == 0
+    sections = re.findall(r"'(/\S+hand_sim):'", node.output)
+    assert len(sections) == 2
+    for section in sections:
+        file.write_text(f"{section}: {{ros__parameters: {{object: ball}}}}\n")
+        with processes(NodeProcess("hand_sim", "--ros-args", "--params-file", str(file))) as (node,):
+            assert node.wait() == 2 and "is 'ball'; valid are none, soft, rigid" in node.output
+
+
+def test_a_topic_is_renamed_in_the_old_way_too(peer):
+    peer.hear_diagnostics()
+    with processes(NodeProcess("hand_sim", "motor/voltage:=/volts", "reference_position:=/x", "__node:=sim")):
+        peer.until(lambda: bool(peer.status("/hannes/sim")), what="diagnostics")
+
+
+@pytest.mark.parametrize("period", [1e-4, 0.00033, 0.1])
+def test_any_control_period_of_the_range_will_do(peer, period):
+    peer.hear_diagnostics()
+    with processes(NodeProcess("hand_sim", period=period)):
+        peer.until_status("hand_sim", lambda s: int(s["tick"]) > 0, "a tick")
 
 
 def test_a_diverging_plant_ends_the_node_with_one_line(ros_environment, tmp_path):

@@ -19,6 +19,7 @@ from .mcap_file import Limits
 from .storage import BagMessages, TopicEntry, locate
 
 CLOCK_TOPIC = "/clock"
+DIAGNOSTICS_TOPIC = "/diagnostics"
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,8 @@ def load_playlist(
 ) -> Playlist:
     """Read what is to be played.
 
-    topics  names of the topics to play; all but /clock (which the player makes itself) if empty
+    topics  names of the topics to play; if empty, all but /diagnostics, which would tell of nodes that run now;
+            /clock is never among them, the player makes it itself
     start   s to skip at the beginning
     Raises HannesError: unreadable bag, unknown topic, nothing left to play.
     """
@@ -60,7 +62,7 @@ def load_playlist(
     times: list[int] = []
     entries: list[tuple[str, bytes]] = []
     for topic, logged, data in messages:
-        if topic != CLOCK_TOPIC and (not topics or topic in topics):
+        if topic != CLOCK_TOPIC and (topic in topics if topics else topic != DIAGNOSTICS_TOPIC):
             times.append(logged)
             entries.append((topic, bytes(data)))
     missing = sorted(set(topics) - set(messages.types) - {CLOCK_TOPIC})

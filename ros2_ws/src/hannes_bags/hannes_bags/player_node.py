@@ -29,7 +29,13 @@ _FAST_TICKS = 5
 acknowledgements come with heartbeats, every 3 s: what bounds the speed is what a Python subscriber can take."""
 _TICKS_AT_ONCE = 1000
 _ARRIVAL_S = 3.5
+_LOOK_S = 0.1
+_QUIET_S, _LONGEST_S = 0.5, 3.0
+"""Others are known when the graph has not changed for the first time, or after the second at the latest."""
+_SAY_AGAIN_S = 5.0
 _DEPTH = 2000
+_OF_EVERY_NODE = ("/rosout", "/parameter_events")
+"""What each ROS node publishes."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +47,8 @@ class PlayerParameters:
     fast: bool = parameter(
         False, "as fast as subscribers can follow (5000 ticks a second), instead of at `rate`"
     )
-    topics: tuple[str, ...] = parameter((), "topics to play; empty for all")
+    topics: tuple[str, ...] = parameter((), "topics to play; empty for all but /diagnostics")
+    beside: bool = parameter(False, "play topics too that another node publishes")
     start: float = parameter(0.0, "time to skip at the beginning", lower=0.0, upper=1e6, unit="s")
     loop: bool = parameter(False, "begin again at the end; simulated time goes on")
     clock: bool = parameter(True, "publish /clock with the bag's times")
@@ -56,7 +63,10 @@ class PlayerParameters:
 
 
 class PlayerNode(HannesNode, Node):
-    """Publishes a bag's messages as they lie in it, serialised."""
+    """Publishes a bag's messages as they lie in it, serialised.
+
+    A topic has one source: where another node publishes a topic of the bag too, it refuses to begin.
+    """
 
     node_name = "player"
     parameters = PlayerParameters
@@ -70,14 +80,18 @@ class PlayerNode(HannesNode, Node):
         self._sim_clock: Publisher | None = topics.clock_publisher(self) if p.clock else None
         self._outputs = {entry.name: self._publisher(entry) for entry in playlist.topics}
         self._began: float | None = None
-        self._created = monotonic()
+        self._created = self._changed = monotonic()
+        self._complete: float | None = None
+        self._seen: object = None
         self._clocked = 0.0
         self._count = 0
         self._last_ns = -1
-        self.wall_timer(_STEP_S, self._step)
-        self.get_logger().info(
-            f"playing {len(playlist.entries)} messages on {len(self._outputs)} topics, {playlist.duration:.3f} s"
+        self._what = (
+            f"{len(playlist.entries)} messages on {len(self._outputs)} topics, {playlist.duration:.3f} s"
         )
+        self.wall_timer(_STEP_S, self._step)
+        if not p.beside:
+            self.wall_timer(_LOOK_S, self._look)
 
     def _publisher(self, entry: TopicEntry) -> Publisher:
         offered = Qos.from_text(entry.offered_qos)
@@ -124,8 +138,55 @@ class PlayerNode(HannesNode, Node):
                         f"{', '.join(missing)}."
                     )
                 return False
+        self._complete = self._complete or monotonic()
+        if not self._p.beside and not self._alone(monotonic() - self._complete):
+            return False
         self._began = monotonic()
+        self.get_logger().info(f"playing {self._what}")
         return True
+
+    def _look(self) -> None:
+        """Whether the graph still changes; while it plays, whether somebody else began to."""
+        if self._began is None:
+            listeners = [output.get_subscription_count() for output in self._outputs.values()]
+            seen = len(self.get_node_names()), listeners, self._others()
+            if seen != self._seen:
+                self._seen, self._changed = seen, monotonic()
+        elif others := self._others():
+            self.get_logger().error(
+                f"Another node publishes what is being played: {_listed(others)}; end one of the two.",
+                throttle_duration_sec=_SAY_AGAIN_S,
+            )
+
+    def _alone(self, waited: float) -> bool:
+        """Whether nobody else publishes what is to be played, after a wait (s) in which they are found; the node
+        ends if somebody does."""
+        if min(waited, monotonic() - self._changed) < _QUIET_S and waited < _LONGEST_S:
+            return False
+        others = self._others()
+        if others:
+            clock = " (clock:=false leaves /clock out)" if topics.CLOCK_TOPIC in others else ""
+            self.fail(
+                f"Another node publishes what is to be played: {_listed(others)}. Stop it, name the topics to play "
+                f"(--topic of hannes play){clock}, or give beside:=true to play all the same."
+            )
+        return not others
+
+    def _others(self) -> dict[str, list[str]]:
+        """By topic that is played: the other nodes that publish it."""
+        others = {}
+        for output in (*self._outputs.values(), *([self._sim_clock] if self._sim_clock else [])):
+            if (topic := output.topic_name) in _OF_EVERY_NODE:
+                continue
+            found = [
+                f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+                for info in self.get_publishers_info_by_topic(topic)
+            ]
+            if (own := self.get_fully_qualified_name()) in found:
+                found.remove(own)  # once: another player may have the same name
+            if found:
+                others[topic] = sorted(found)
+        return others
 
     def _tell_time(self, stamp_ns: int, now: float) -> None:
         if self._sim_clock is not None and stamp_ns > self._last_ns:
@@ -138,7 +199,16 @@ class PlayerNode(HannesNode, Node):
         for output in self._outputs.values():
             if self._began is not None:
                 output.wait_for_all_acked(Duration(seconds=max(0.0, until - monotonic())))
-        self.get_logger().info(f"played {self._count} messages")
+        if self._began is not None:
+            self.get_logger().info(f"played {self._count} messages")
+
+
+def _listed(others: dict[str, list[str]]) -> str:
+    """The topics of each node, as text."""
+    by_nodes: dict[str, list[str]] = {}
+    for topic, nodes in others.items():
+        by_nodes.setdefault(", ".join(nodes), []).append(topic)
+    return "; ".join(f"{', '.join(names)} by {nodes}" for nodes, names in by_nodes.items())
 
 
 def main() -> None:

@@ -201,14 +201,16 @@ class Model:
         provenance = content.get("provenance") or {}
         if not isinstance(variant, Mapping) or not isinstance(provenance, Mapping):
             raise HannesError(f"{where}: 'variant' and 'provenance' must be mappings.")
+        effects = _read_effects(content.get("effects") or [], where, path.parent)
+        given_here = [*map(str, overrides), *(f"{e.name}.{n}" for e in effects for n in e.parameters)]
         return cls(
             name=str(content.get("name", path.stem)),
             plant=_beside(str(content.get("plant", "reduced")), path.parent),
-            parameters=ParameterSet(changed, parameters.source, {str(name): where for name in overrides}),
+            parameters=ParameterSet(changed, parameters.source, dict.fromkeys(given_here, where)),
             base=str(base_path),
             controller=_beside(str(content.get("controller", "double_pid")), path.parent),
             variant=variant,
-            effects=_read_effects(content.get("effects") or [], where, path.parent),
+            effects=effects,
             provenance=provenance,
         )
 

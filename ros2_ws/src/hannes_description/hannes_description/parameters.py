@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +89,11 @@ class Parameter:
                 + (f"missing keys {missing}; " if missing else "")
                 + f"valid keys are {', '.join(_KEYS)}."
             )
+        for key in ("value", "lower", "upper"):
+            if isinstance(entry[key], bool) or not isinstance(entry[key], Real):
+                raise HannesError(
+                    f"{where}: parameter '{name}': {key} is {entry[key]!r}; it must be a number."
+                )
         try:
             return cls(
                 float(entry["value"]),
@@ -106,7 +113,7 @@ class ParameterSet(Mapping[str, Parameter]):
     """Parameters by dotted name, such as `motor.resistance`; immutable.
 
     source   the file that they are from
-    origins  the file of those that are from another one, by name
+    origins  the file of those that are from another one, and of those of a model's effects, by name
     """
 
     entries: Mapping[str, Parameter]
@@ -158,6 +165,14 @@ class ParameterSet(Mapping[str, Parameter]):
                     f"{self.origin(name)}: {name} is {self.value(name):g} {self[name].unit}; {who} needs more than 0."
                 )
 
+    def require_not_negative(self, names: Iterable[str], who: str) -> None:
+        """Raise a HannesError for the first of the named parameters, where it is there, that is below 0."""
+        for name in names:
+            if name in self and self.value(name) < 0.0:
+                raise HannesError(
+                    f"{self.origin(name)}: {name} is {self.value(name):g} {self[name].unit}; {who} needs 0 or more."
+                )
+
     def values_of(self, group: str) -> dict[str, float]:
         """All values of a group, by the name after the dot: `values_of("motor")["resistance"]`."""
         out = {n.split(".", 1)[1]: p.value for n, p in self.entries.items() if n.split(".", 1)[0] == group}
@@ -203,12 +218,41 @@ class ParameterSet(Mapping[str, Parameter]):
 MAX_YAML_BYTES = 4_000_000
 
 
+class _OneOfEach:
+    """What a YAML loader lacks: a key that is given twice is refused, and 1e-6 is a number as it is everywhere else."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        given: set[tuple[str, str]] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if (key.tag, key.value) in given:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"the key '{key.value}' is given twice", key.start_mark
+                    )
+                given.add((key.tag, key.value))
+        return super().construct_mapping(node, deep)  # type: ignore[misc]
+
+
+class _SafeLoader(_OneOfEach, yaml.SafeLoader):
+    pass
+
+
+class _FastSafeLoader(_OneOfEach, getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    pass
+
+
+for _loader in (_SafeLoader, _FastSafeLoader):
+    _loader.add_implicit_resolver(
+        "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+    )
+
+
 def read_yaml(path: Path, what: str) -> Any:
     """Read YAML safely; one clear error for a missing, unreadable, oversized or broken file.
 
     The pure Python loader for the files of others: libyaml's is ten times as fast, but crashes on deep nesting.
     """
-    ours = path.is_relative_to(data_path()) and yaml.__with_libyaml__
+    loader = _FastSafeLoader if path.is_relative_to(data_path()) else _SafeLoader
     try:
         if path.stat().st_size > MAX_YAML_BYTES:
             raise HannesError(f"{what} '{path}' has more than {MAX_YAML_BYTES} bytes; that is no such file.")
@@ -216,7 +260,7 @@ def read_yaml(path: Path, what: str) -> Any:
     except (OSError, UnicodeDecodeError) as error:
         raise HannesError(f"Cannot read {what} '{path}': {error}.") from error
     try:
-        return yaml.load(text, Loader=yaml.CSafeLoader) if ours else yaml.safe_load(text)
+        return loader(text).get_single_data()
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise HannesError(f"{what} '{path}' is not valid YAML: {yaml_fault(error)}.") from error
 

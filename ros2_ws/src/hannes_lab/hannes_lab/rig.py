@@ -7,7 +7,6 @@ loop; an adapter derives from it and gives a reader, a model, tolerances and the
 from __future__ import annotations
 
 import math
-import re
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from hannes_control import double_pid
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.parameters import read_yaml
+from hannes_description.units import any_unit, linear_unit, same_unit, tokens
 from hannes_sim import reduced
 from hannes_sim.effect import EffectType, call_own, catalogue, load_class
 from hannes_sim.factory import PLANTS, make_plant
@@ -441,14 +441,11 @@ def _check_units(model: Model, *, control: bool) -> None:
     A linear machine's are only those that go together.
     """
     theirs, parameters = Model.load().parameters, model.parameters
-    # Without a resistance or a back-EMF the command may be a current or a torque, and nothing is in volts or amperes.
-    volts = "motor.resistance" in parameters and "motor.emf_compensated" not in parameters
     for name in parameters:
         if name not in theirs or (name.startswith("control.") and not control):
             continue
         given, wanted = parameters[name].unit, theirs[name].unit
-        free = not volts and any(token in ("V", "A", "ohm") for token, _ in _tokens(wanted))
-        if not (free or _same(given, wanted)):
+        if not (any_unit(wanted, parameters) or same_unit(given, wanted)):
             raise HannesError(
                 f"{parameters.origin(name)}: parameter '{name}' is in '{given}'; the plant '{model.plant}' takes "
                 f"'{wanted}': convert value, lower and upper."
@@ -501,61 +498,12 @@ def _rebuild(rig: str | type[PlantRig], trials: tuple[Trial, ...]) -> PlantRig:
 
 
 # -- effects of the catalogue on a machine of another size ----------------------------------------------------------
-def _tokens(unit: str) -> list[tuple[str, float]]:
-    """Base units of a unit such as N.m.s/rad or rad/(N.m), with exponents."""
-    out: list[tuple[str, float]] = []
-    marked = unit.replace("kg.m2", "J").replace("N.m", "T")
-    for part, sign in zip(marked.split("/"), (1.0, *[-1.0] * marked.count("/")), strict=True):
-        for token in part.strip("()").split("."):
-            match = re.fullmatch(r"([A-Za-z]+)(\d*)", token)
-            if match:
-                power = sign * float(match.group(2) or 1)
-                name = {"T": "N.m", "J": "kg.m2"}.get(match.group(1), match.group(1))
-                out.append((name, power))
-    return out
-
-
-_SI = {
-    "N.m": (1, 2, -2, 0),
-    "kg.m2": (1, 2, 0, 0),
-    "N": (1, 1, -2, 0),
-    "V": (1, 2, -3, -1),
-    "ohm": (1, 2, -3, -2),
-    "H": (1, 2, -2, -2),
-    "kg": (1, 0, 0, 0),
-    "m": (0, 1, 0, 0),
-    "s": (0, 0, 1, 0),
-    "A": (0, 0, 0, 1),
-    "rad": (0, 0, 0, 0),
-}
-"""Exponents of kg, m, s and A: units of SI that have the same are the same, as N.m/A and V.s/rad are."""
-
-
-def _same(unit: str, other: str) -> bool:
-    """Whether a number means the same in both units."""
-
-    def powers(unit: str) -> list[float] | None:
-        tokens = _tokens(unit)
-        if (unit != "1" and not tokens) or any(token not in _SI for token, _ in tokens):
-            return None
-        return [sum(power * _SI[token][k] for token, power in tokens) for k in range(4)]
-
-    return unit == other or (powers(unit) is not None and powers(unit) == powers(other))
-
-
 def unit_factor(unit: str, sizes: Mapping[str, float]) -> float:
     """How much larger a quantity of this unit is on a machine of the given sizes than on the reference machine."""
     ratio = {token: sizes.get(token, size) / size for token, size in REFERENCE_SIZES.items()}
     ratio["kg.m2"] = ratio["N.m"] * ratio["s"] ** 2 / ratio["rad"]
     ratio["ohm"] = ratio["V"] / ratio["A"]
-    return math.prod(ratio.get(token, 1.0) ** power for token, power in _tokens(unit))
-
-
-def linear_unit(unit: str) -> str:
-    """The unit of the same quantity where the drive is linear: N for N.m, m for rad."""
-    for a, b in (("kg.m2", "kg"), ("(N.m)", "N"), ("N.m", "N"), ("rad", "m")):
-        unit = unit.replace(a, b)
-    return unit
+    return math.prod(ratio.get(token, 1.0) ** power for token, power in tokens(unit))
 
 
 @lru_cache(maxsize=512)

@@ -69,6 +69,7 @@ def _run(names: Sequence[str], executor: str, arguments: list[str]) -> int:
         return 0
     import rclpy
 
+    _refuse_bare_parameters(arguments)
     arguments, local = _node_rules(arguments, [cls.node_name for cls in classes])
     context = _init(arguments)
     nodes: list[Any] = []
@@ -141,6 +142,26 @@ def _init(arguments: list[str]) -> Context:
     return get_default_context()
 
 
+def _refuse_bare_parameters(arguments: list[str]) -> None:
+    """Refuse `name:=value` outside --ros-args, but for a topic or a node's name.
+
+    rcl takes any for an old way to rename, and a parameter that was meant would be ignored.
+    """
+    from hannes_description.signals import SIGNALS
+
+    topics = {signal.topic for signal in SIGNALS.values()}
+    ours = True
+    for word in arguments[1:]:
+        ours = word == "--" if word in ("--", "--ros-args") else ours
+        name, renames, _ = word.partition(":=")
+        name = name.rpartition(":")[2]
+        if ours and renames and not (name.startswith("__") or "/" in name or name in topics):
+            raise HannesError(
+                f"'{word}' is no parameter outside --ros-args; give it as '--ros-args -p {word}' (--help lists the "
+                "parameters)."
+            )
+
+
 def _node_rules(arguments: list[str], names: Sequence[str]) -> tuple[list[str], dict[str, list[str]]]:
     """Take `-p node:name:=value` out of the arguments, as arguments of that node alone.
 
@@ -198,9 +219,15 @@ def _first_line(error: BaseException) -> str:
 
 
 def _help(program: str, classes: Sequence[Any]) -> None:
+    from .node import DEFAULT_NAMESPACE
     from .node_parameters import help_text
 
+    node = classes[0].node_name
     print(f"usage: {program} [--ros-args -p name:=value -r old:=new --params-file FILE.yaml ...]")
+    print(
+        f"FILE.yaml has a section '/{DEFAULT_NAMESPACE}/{node}:' (or '/**/{node}:' in any namespace, '/**:' for all "
+        f"nodes)\nwith 'ros__parameters:' in it; a section of another name, such as '{node}:', is not read."
+    )
     for cls in classes:
         title = (cls.__doc__ or "").strip().split("\n")[0]
         print(f"\n{cls.node_name}: {title}\n{help_text(cls.parameters)}")

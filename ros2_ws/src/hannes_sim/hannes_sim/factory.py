@@ -6,8 +6,9 @@ from typing import Any
 
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.units import any_unit, linear_unit, same_unit
 
-from .effect import load_class
+from .effect import effect_of, load_class
 from .objects import GraspObject
 from .plant import DEFAULT_DT, Plant
 
@@ -19,10 +20,37 @@ def is_plant(name: str) -> bool:
     return name in PLANTS or ":" in name
 
 
+def check_effects(model: Model) -> None:
+    """Raise a HannesError for an effect of the model with wrong parameters, or one in a unit that is not its own.
+
+    Where the drive is linear N stands for N.m and m for rad; that cannot be told from here, and changes no number.
+    """
+    parameters = model.parameters
+    inertia = parameters["motor.armature"].unit if "motor.armature" in parameters else "kg.m2"
+    # A machine of one's own plant, or one that counts in grams, has the units that go together.
+    if model.plant not in PLANTS or not (same_unit(inertia, "kg") or same_unit(inertia, "kg.m2")):
+        return
+    for entry in model.effects:
+        own = {p.name: p.unit for p in effect_of(entry).figures()}
+        for name, given in entry.parameters.items():
+            wanted = own[name]
+            fits = same_unit(given.unit, wanted) or same_unit(given.unit, linear_unit(wanted))
+            if not (fits or given.unit == wanted or any_unit(wanted, parameters)):
+                raise HannesError(
+                    f"{parameters.origin(f'{entry.name}.{name}')}: effect '{entry.name}': {name} is in "
+                    f"'{given.unit}'; it must be in '{wanted}': convert value, lower and upper."
+                )
+
+
 def make_plant(model: Model, grasp: GraspObject | None = None, *, dt: float | None = None) -> Plant:
     """The plant of a model: `reduced`, `mujoco`, or a user's own `path.py:Class` called with (model, grasp, dt=...)."""
     step = DEFAULT_DT if dt is None else dt
+    check_effects(model)
     if model.plant == "reduced":
+        if model.variant:  # which this plant has not, but a misspelt one is one here too
+            from hannes_description.mjcf import Variant
+
+            Variant.of(model.variant)
         from .reduced import ReducedPlant
 
         return ReducedPlant(model, grasp, dt=step)

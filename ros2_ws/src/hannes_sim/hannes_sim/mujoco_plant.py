@@ -50,7 +50,7 @@ from .effect import BoundEffects
 from .motor import begin_step, evaluate_effects, motor_torque, sense
 from .native import ADVANCE_SIGNATURE, call_2, pointer_f8, pointer_i8
 from .objects import GraspObject
-from .plant import DEFAULT_DT, POSITIVE, PlantDiverged, Reading
+from .plant import DEFAULT_DT, NOT_NEGATIVE, POSITIVE, PlantDiverged, Reading
 from .ports import (
     COMPLIANCE,
     CONTACT,
@@ -279,6 +279,7 @@ _NAMES = {
     "hand.fingertip_travel": _TIP,
 }
 _GROUPS = ("geometry", "inertia", "gravity", "pulleys", "springs", "joints", "carts", "wires")
+_NOT_NEGATIVE_GROUPS = ("inertia", "springs", "joints", "carts", "wires")
 _REBUILD = ("motor.armature", "gear.ratio", "pulley.radius")
 
 _SCALED = {"hand.preload": 0.0107, "hand.stiffness": 0.0015, "hand.coulomb": 0.008}
@@ -306,6 +307,8 @@ class MujocoPlant:
         self.grasp = grasp
         self._values = model.parameters
         self._values.require_positive(POSITIVE, "the multi-body plant")
+        matter = [name for name in self._values if name.split(".")[0] in _NOT_NEGATIVE_GROUPS]
+        self._values.require_not_negative([*NOT_NEGATIVE, *matter], "the multi-body plant")
         self._scaled = {
             name: self._values.value(name) if name in self._values else given
             for name, given in _SCALED.items()

@@ -27,6 +27,22 @@ DEFAULT_DT = 0.25e-3
 POSITIVE = ("supply.voltage", "motor.kt", "motor.armature", "motor.resistance", "gear.ratio")
 """Parameters of a drive that is there: without one of them above 0 nothing moves, or everything at once."""
 
+NOT_NEGATIVE = (
+    "motor.inductance",
+    "gear.efficiency",
+    "encoder.resolution",
+    "friction.coulomb",
+    "friction.viscous",
+    "wire.stiffness",
+    "wire.damping",
+    "hand.inertia",
+    "hand.stiffness",
+    "hand.coulomb",
+    "hand.viscous",
+    "hand.stop_stiffness",
+)
+"""Parameters of which less than 0 is no matter: it would give energy away."""
+
 
 class PlantDiverged(HannesError, RuntimeError):
     """The simulation became unstable or non-finite; the message names the time and the coordinate."""

@@ -29,7 +29,7 @@ from .effect import BoundEffects
 from .motor import begin_step, dry_friction, evaluate_effects, motor_torque, sense
 from .native import ADVANCE_SIGNATURE, pointer_f8
 from .objects import GraspObject
-from .plant import DEFAULT_DT, POSITIVE, PlantDiverged, Reading
+from .plant import DEFAULT_DT, NOT_NEGATIVE, POSITIVE, PlantDiverged, Reading
 from .ports import (
     COMPLIANCE,
     CONTACT,
@@ -257,6 +257,7 @@ class ReducedPlant:
         values = model.parameters
         values.require({"the reduced plant": NEEDED})
         values.require_positive(POSITIVE, "the reduced plant")
+        values.require_not_negative(NOT_NEGATIVE, "the reduced plant")
         # A drive without a gearbox, or whose command is a current, need not name these.
         self.parameters[[P_RATIO, P_EFFICIENCY, P_RESISTANCE]] = 1.0
         for name, index in _NAMES.items():

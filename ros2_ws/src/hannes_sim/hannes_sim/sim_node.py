@@ -23,7 +23,7 @@ from rclpy.node import Node
 
 from .factory import make_plant
 from .objects import GraspObject, named_object
-from .rollout import substeps_of
+from .rollout import step_of, substeps_of
 
 _CHECK_S = 0.02
 _LONGEST_CATCH_UP_S = 0.1
@@ -97,7 +97,7 @@ class HandSim(HannesNode, Node):
         self._p = p = declare(self, HandSimParameters)
         model = Model.load(p.model)
         model = model.with_plant(p.plant) if p.plant else model
-        self._plant = make_plant(model, p.grasp())
+        self._plant = make_plant(model, p.grasp(), dt=step_of(p.period))
         self._substeps = substeps_of(p.period, self._plant.dt)
         self._gate = CommandGate(model.parameters.value("supply.voltage"), p.command_timeout_ms / 1e3)
         self._torque_constant = model.parameters.value("motor.kt") * model.parameters.value("gear.ratio")

@@ -110,12 +110,25 @@ def play(
     fast: Annotated[bool, typer.Option("--fast", help="As fast as the subscribers can follow.")] = False,
     loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
     start: Annotated[float, typer.Option(min=0.0, help="Time to skip at the beginning, s.")] = 0.0,
-    topic: TopicOption = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--topic", help="Only this topic; may be given several times. Without it all but /diagnostics."
+        ),
+    ] = None,
+    beside: Annotated[
+        bool, typer.Option("--beside", help="Play topics too that another node publishes.")
+    ] = False,
     more: MoreArgument = None,
 ) -> None:
-    """Play a bag back onto its topics, with /clock."""
+    """Play a bag back onto its topics, with /clock.
+
+    A topic that another node publishes already is refused: motor/voltage of a bag would drive the motor too.
+    """
     parameters: dict[str, Any] = {"bag": str(bag.absolute()), "rate": rate, "start": start}
-    parameters |= {name: True for name, wanted in (("fast", fast), ("loop", loop)) if wanted}
+    parameters |= {
+        name: True for name, wanted in (("fast", fast), ("loop", loop), ("beside", beside)) if wanted
+    }
     if topic:
         parameters["topics"] = topic
     _become("player", parameters, more or [])

@@ -36,11 +36,10 @@ def show(
     """Show a model: every parameter with unit, bounds, status and source, and the effects that were added."""
     from hannes_description.model import Model
     from hannes_description.parameters import load_parameters
-    from hannes_sim.effect import effect_of
+    from hannes_sim.factory import check_effects
 
     loaded = Model.load(model)
-    for effect in loaded.effects:
-        effect_of(effect)
+    check_effects(loaded)
     base = load_parameters(loaded.base)
     parameters = {
         name: parameter
