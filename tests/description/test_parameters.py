@@ -158,10 +158,12 @@ def test_what_a_plant_cannot_mean_is_refused(tmp_path: Path, more: str, message:
     assert str(caught.value).startswith(f"{file}: ") or "variant" in more
 
 
-def test_an_effect_on_a_linear_machine_is_in_newtons(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "unit"), [("motor.armature", "kg"), ("gear.ratio", "rad/m")])
+def test_an_effect_on_a_linear_machine_is_in_newtons(tmp_path: Path, name: str, unit: str) -> None:
+    """A linear motor, and a rotor on a lead screw."""
     base = tmp_path / "base.yaml"
     shown = {name: p.to_dict() for name, p in load_parameters("hannes").items()}
-    shown["motor.armature"]["unit"] = "kg"
+    shown[name]["unit"] = unit
     base.write_text(json.dumps(shown))
     file = tmp_path / "mine.yaml"
     for unit in ("N", "N.m", "mN"):

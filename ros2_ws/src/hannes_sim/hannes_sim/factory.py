@@ -21,21 +21,21 @@ def is_plant(name: str) -> bool:
 
 
 def check_effects(model: Model) -> None:
-    """Raise a HannesError for an effect of the model with wrong parameters, or one in a unit that is not its own.
-
-    Where the drive is linear N stands for N.m and m for rad; that cannot be told from here, and changes no number.
-    """
+    """Raise a HannesError for an effect of the model with wrong parameters, or one in a unit that is not its own."""
     parameters = model.parameters
     inertia = parameters["motor.armature"].unit if "motor.armature" in parameters else "kg.m2"
-    # A machine of one's own plant, or one that counts in grams, has the units that go together.
-    if model.plant not in PLANTS or not (same_unit(inertia, "kg") or same_unit(inertia, "kg.m2")):
-        return
+    # A lead screw's ratio is in rad/m, and leaves the rotor's inertia in kg.m2.
+    linear = same_unit(inertia, "kg") or (
+        "gear.ratio" in parameters and same_unit(parameters["gear.ratio"].unit, "1/m")
+    )
+    # A machine of one's own plant, or a linear one that counts in grams, has the units that go together.
+    checked = model.plant in PLANTS and (linear or same_unit(inertia, "kg.m2"))
     for entry in model.effects:
         own = {p.name: p.unit for p in effect_of(entry).figures()}
         for name, given in entry.parameters.items():
-            wanted = own[name]
-            fits = same_unit(given.unit, wanted) or same_unit(given.unit, linear_unit(wanted))
-            if not (fits or given.unit == wanted or any_unit(wanted, parameters)):
+            wanted = linear_unit(own[name]) if linear else own[name]
+            fits = same_unit(given.unit, wanted) or (linear and given.unit == own[name])
+            if checked and not (fits or any_unit(wanted, parameters)):
                 raise HannesError(
                     f"{parameters.origin(f'{entry.name}.{name}')}: effect '{entry.name}': {name} is in "
                     f"'{given.unit}'; it must be in '{wanted}': convert value, lower and upper."
