@@ -12,7 +12,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export VENV
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench build lock rosdep clean distclean
+.PHONY: help setup demo test quick check bench build lock rosdep clean distclean
 
 help: ## list these commands
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -26,6 +26,9 @@ demo: setup ## a closure recorded, compared, diagnosed; ends with the path of a 
 
 test: setup ## all tests
 	@$(BIN)/python -m pytest $(PYTEST_FLAGS) $(TESTS)
+
+quick: setup ## the tests without those that take more than about twenty seconds each
+	@$(BIN)/python -m pytest $(PYTEST_FLAGS) -m "not slow" $(TESTS)
 
 check: setup ## ruff (rules and layout) and mypy
 	@status=0; $(BIN)/ruff check . || status=1; $(BIN)/ruff format --check --quiet . || status=1; $(BIN)/mypy --config-file pyproject.toml || status=1; \
