@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,9 +27,10 @@ from hannes_lab.hand import HandRig, outer_loop
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import load_trials, prepare
 from hannes_lab.problem import nuisance_coordinate
-from hannes_lab.rig import COMES_BACK
+from hannes_lab.rig import COMES_BACK, Nuisance
 from hannes_lab.search import Candidate, Search, wide_starts
 from hannes_lab.trials import SAME, Closure, Trial, make_trial
+from hannes_lab.wording import _taken_for_its_own
 from hannes_sim.effect import load_effect, strength_of
 from hannes_sim.ports import R_QL
 from lab.foreign_bags import Signals, one_after_the_other, signals_of_set, write_bag, write_set
@@ -196,6 +199,26 @@ def test_the_damping_of_an_object_that_nobody_described_is_an_effect_where_it_is
     other = diagnose(prepared, effect_sources(only=["viscous_friction"]), max_effects=1)
     assert other.verdict == "nothing", "no effect of that name is considered"
     assert other.nuisances[own[0].name]["value"] == pytest.approx(0.02, rel=0.5), "taken over"
+
+
+def test_a_damping_that_may_be_the_objects_own_is_pointed_at() -> None:
+    """From far off on it is named; below, the recordings cannot tell, but who knows the object can."""
+    own = Nuisance("object.damping@ball", 7e-5, 1.5, True, 0.0, "N.m.s/rad", effect="object_damping")
+    coordinate = nuisance_coordinate(own)
+
+    def said(
+        z: float, names: tuple[str, ...] = (), sources: Sequence[str] = ("object_damping",)
+    ) -> list[str]:
+        found = Fit(Model.load(), (coordinate,), np.array([z]), 0.0, np.zeros(1), np.zeros((1, 1)))
+        search: Any = SimpleNamespace(nuisances=[own], sources=dict.fromkeys(sources, ""))
+        return _taken_for_its_own(search, Candidate(names, found, 0.0))
+
+    (note,) = said(2.5)
+    assert (
+        note.startswith("ball: object.damping is fitted at 43 times the nominal")
+        and "object_damping is missing" in note
+    )
+    assert not (said(1.0) or said(3.5) or said(2.5, names=("object_damping",)) or said(2.5, sources=()))
 
 
 @pytest.mark.slow

@@ -29,6 +29,9 @@ CLOCK_PART = 0.25
 CLOCK_STEPS = 6
 """Length of the fit that tells it."""
 
+UNUSUAL = 1.5
+"""Standard deviations of a wide prior from which a parameter that stands for an effect is worth a note."""
+
 NAMED = 4
 """Effects that a sentence names; of more, it says how many."""
 
@@ -118,6 +121,7 @@ def notes(
         *_inseparable(search, experiments),
         *_ends(best),
         *_undescribed(best),
+        *_taken_for_its_own(search, best),
         *_identifiability(best),
         *failure_notes(search.problem),
     )
@@ -267,6 +271,21 @@ def _undescribed(best: Candidate) -> list[str]:
         f"{place}: fitted too, as the recording does not tell: {', '.join(own)}"
         for place, own in fitted.items()
     ]
+
+
+def _taken_for_its_own(search: Search, best: Candidate) -> list[str]:
+    """Parameters of a recording that an effect would move too, and that are larger than usual without being far off."""
+    notes = []
+    for n in search.nuisances:
+        z = best.fit.point.get(n.name, 0.0)
+        if n.effect in search.sources and n.effect not in best.names and UNUSUAL < z <= FAR:
+            name, _, place = n.name.partition("@")
+            value = best.fit.values[n.name]
+            notes.append(
+                f"{place or 'all recordings'}: {name} is fitted at {value / n.mean:.0f} times the nominal, as the "
+                f"recording does not tell it; if it is known to be no larger than usual, {n.effect} is missing"
+            )
+    return notes
 
 
 def _identifiability(best: Candidate) -> list[str]:
