@@ -109,6 +109,17 @@ def test_shifted_stamps() -> None:
     assert cdr.shift_stamp(b"\x00\x01\x00\x00", 5) == b"\x00\x01\x00\x00"
 
 
+def test_a_loop_goes_on_from_a_first_stamp_of_zero(tmp_path: Path) -> None:
+    """The first tick of a lock-step has it; a message of a topic that is never stamped keeps its 0."""
+    stamps = np.arange(0, 5, dtype=np.int64) * MS
+    looped = Schedule(load_playlist(foreign_bag(tmp_path / "bag", motor_messages(stamps))), loop=True)
+    ticks = looped.due(0.02)
+    states = [
+        cdr.stamp_at(data) for _, messages in ticks for topic, data in messages if topic.endswith("state")
+    ]
+    assert len(states) > 10 and states == sorted(set(states))
+
+
 def test_the_schedule_follows_the_rate_and_loops(tmp_path: Path) -> None:
     stamps = np.arange(1, 11, dtype=np.int64) * MS
     bag = foreign_bag(tmp_path / "bag", motor_messages(stamps))

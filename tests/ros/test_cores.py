@@ -223,8 +223,11 @@ def test_rate_of_arrivals_counts_from_the_first_message():
     assert arrivals.rate() == pytest.approx(50.0)
     assert arrivals.rate() is None
     arrivals.came(100.0)  # after a rest it begins anew
-    arrivals.came(100.5)
-    assert arrivals.rate() == pytest.approx(2.0)
+    arrivals.came(100.1)
+    assert arrivals.rate() == pytest.approx(10.0)
+    for at in (100.2, 101.7, 101.8, 101.9):  # as it does after a gap: who was started again is not slow
+        arrivals.came(at)
+    assert arrivals.rate() == pytest.approx(10.0)
 
 
 def test_missed_cycles_warn_and_then_are_an_error():

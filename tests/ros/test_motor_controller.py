@@ -260,6 +260,26 @@ def test_states_without_a_stamp_are_rejected_and_said(peer):
         peer.until_status(NAME, lambda s: said in s["message"], "the reason")
 
 
+def test_a_state_that_comes_late_among_others_is_counted_only(peer):
+    """A busy machine makes it late; its clock is the same."""
+    peer.hear_diagnostics()
+    sensors = Sensors(peer)
+    limits = {**Sensors.patient, "state_timeout_ms": 200}
+    with processes(NodeProcess(NAME, **limits)) as (node,):
+        announce(peer)
+        sensors.until(lambda s: int(s["resets"]) > 0, "a controller that hears")
+
+        def late() -> bool:
+            sensors.say()
+            sensors.stamped_ahead = -0.3
+            sensors.say()
+            sensors.stamped_ahead = 0.0
+            return int(peer.status(NAME).get("rejected_states", 0)) > 3
+
+        peer.until(late, what="late states")
+        assert "it is stamped" not in node.output and "it is stamped" not in peer.status(NAME)["message"]
+
+
 def test_states_that_come_too_slowly_are_said(peer):
     peer.hear_diagnostics()
     sensors = Sensors(peer)

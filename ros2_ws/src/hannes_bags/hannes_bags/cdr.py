@@ -314,9 +314,9 @@ def stamp_at(data: bytes) -> int | None:
 
 
 def shift_stamp(data: bytes, by_ns: int) -> bytes:
-    """The message with the stamp at its beginning moved by so many ns; a zero stamp (not stamped) stays."""
+    """The message with the stamp at its beginning moved by so many ns."""
     layout, stamp = _TIME.get(bytes(data[:2])), stamp_at(data)
-    if layout is None or not stamp:
+    if layout is None or stamp is None:
         return data
     seconds, nanoseconds = divmod(stamp + by_ns, 1_000_000_000)
     if not -(2**31) <= seconds < 2**31:

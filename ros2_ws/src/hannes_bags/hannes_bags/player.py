@@ -105,6 +105,7 @@ class Schedule:
         self._ticks = playlist.ticks()
         self._next = next(self._ticks, None)
         self._shift = 0
+        self._stamped = _stamped(playlist) if loop else frozenset()
         self.round = 0
         self.first_ns = int(playlist.log_ns[0])
         gaps = np.diff(np.unique(playlist.log_ns))
@@ -141,8 +142,14 @@ class Schedule:
         """From the second round on, the stamps go on growing with the clock."""
         if not self._shift:
             return messages
-        return tuple((topic, self._shifted(topic, data)) for topic, data in messages)
+        return tuple(
+            (topic, cdr.shift_stamp(data, self._shift) if topic in self._stamped else data)
+            for topic, data in messages
+        )
 
-    def _shifted(self, topic: str, data: bytes) -> bytes:
-        kinds = {entry.name: entry.type for entry in self._playlist.topics}
-        return cdr.shift_stamp(data, self._shift) if kinds[topic] in cdr.stamped_types() else data
+
+def _stamped(playlist: Playlist) -> frozenset[str]:
+    """Topics whose messages are stamped: at least one of them, as the first tick of a lock-step has the stamp 0."""
+    types = cdr.stamped_types()
+    may_be = {entry.name for entry in playlist.topics if entry.type in types}
+    return frozenset(topic for topic, data in playlist.entries if topic in may_be and cdr.stamp_at(data))

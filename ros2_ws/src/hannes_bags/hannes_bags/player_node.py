@@ -76,22 +76,29 @@ class PlayerNode(HannesNode, Node):
         self._p = p = declare(self, PlayerParameters)
         playlist = load_playlist(p.bag, topics=p.topics, start=p.start)
         self._schedule = Schedule(playlist, 0.0 if p.fast else p.rate, loop=p.loop)
-        # First: who finds another topic, and looks for simulated time, finds this too.
-        self._sim_clock: Publisher | None = topics.clock_publisher(self) if p.clock else None
-        self._outputs = {entry.name: self._publisher(entry) for entry in playlist.topics}
+        self._topics = playlist.topics
+        self._sim_clock: Publisher | None = None
+        self._outputs: dict[str, Publisher] = {}
         self._began: float | None = None
-        self._created = self._changed = monotonic()
-        self._complete: float | None = None
+        self._opened: float | None = None
+        self._looked = self._changed = monotonic()
         self._seen: object = None
         self._clocked = 0.0
         self._count = 0
         self._last_ns = -1
         self._what = (
-            f"{len(playlist.entries)} messages on {len(self._outputs)} topics, {playlist.duration:.3f} s"
+            f"{len(playlist.entries)} messages on {len(self._topics)} topics, {playlist.duration:.3f} s"
         )
         self.wall_timer(_STEP_S, self._step)
-        if not p.beside:
-            self.wall_timer(_LOOK_S, self._look)
+        self.wall_timer(_LOOK_S, self._look)
+
+    def _open(self) -> None:
+        """Announce what is to be played."""
+        # First: who finds another topic, and looks for simulated time, finds this too.
+        if self._p.clock:
+            self._sim_clock = topics.clock_publisher(self)
+        self._outputs = {entry.name: self._publisher(entry) for entry in self._topics}
+        self._opened = self._changed = monotonic()
 
     def _publisher(self, entry: TopicEntry) -> Publisher:
         offered = Qos.from_text(entry.offered_qos)
@@ -122,28 +129,37 @@ class PlayerNode(HannesNode, Node):
             self.done = True
 
     def _ready(self) -> bool:
-        """Whether every topic has its subscribers; the time of playing begins then."""
+        """Whether nobody else publishes the topics and each has its subscribers; the time of playing begins then."""
         if self._began is not None:
             return True
-        if self._p.subscribers:
-            missing = [
-                topic
-                for topic, output in self._outputs.items()
-                if output.get_subscription_count() < self._p.subscribers
-            ]
-            if missing:
-                if monotonic() - self._created > self._p.wait:
-                    self.fail(
-                        f"After {self._p.wait:g} s there are not {self._p.subscribers} subscribers of "
-                        f"{', '.join(missing)}."
-                    )
+        if self._opened is None:
+            # Looked for before anything is announced: others would report a second source that never sends.
+            if not (self._p.beside or self._settled(self._looked)) or self._refused():
                 return False
-        self._complete = self._complete or monotonic()
-        if not self._p.beside and not self._alone(monotonic() - self._complete):
+            self._open()
+        assert self._opened is not None
+        missing = [
+            topic
+            for topic, output in self._outputs.items()
+            if output.get_subscription_count() < self._p.subscribers
+        ]
+        if missing:
+            if monotonic() - self._opened > self._p.wait:
+                self.fail(
+                    f"After {self._p.wait:g} s there are not {self._p.subscribers} subscribers of "
+                    f"{', '.join(missing)}."
+                )
+            return False
+        if not self._settled(self._opened) or self._refused():
             return False
         self._began = monotonic()
         self.get_logger().info(f"playing {self._what}")
         return True
+
+    def _settled(self, since: float) -> bool:
+        """Whether all that is there has been found, since a time of the monotonic clock."""
+        now = monotonic()
+        return now - max(since, self._changed) >= _QUIET_S or now - since >= _LONGEST_S
 
     def _look(self) -> None:
         """Whether the graph still changes; while it plays, whether somebody else began to."""
@@ -152,37 +168,33 @@ class PlayerNode(HannesNode, Node):
             seen = len(self.get_node_names()), listeners, self._others()
             if seen != self._seen:
                 self._seen, self._changed = seen, monotonic()
-        elif others := self._others():
+        elif not self._p.beside and (others := self._others()):
             self.get_logger().error(
                 f"Another node publishes what is being played: {_listed(others)}; end one of the two.",
                 throttle_duration_sec=_SAY_AGAIN_S,
             )
 
-    def _alone(self, waited: float) -> bool:
-        """Whether nobody else publishes what is to be played, after a wait (s) in which they are found; the node
-        ends if somebody does."""
-        if min(waited, monotonic() - self._changed) < _QUIET_S and waited < _LONGEST_S:
-            return False
-        others = self._others()
+    def _refused(self) -> bool:
+        """Whether somebody else publishes what is to be played; the node ends then."""
+        others = {} if self._p.beside else self._others()
         if others:
             clock = " (clock:=false leaves /clock out)" if topics.CLOCK_TOPIC in others else ""
             self.fail(
                 f"Another node publishes what is to be played: {_listed(others)}. Stop it, name the topics to play "
-                f"(--topic of hannes play){clock}, or give beside:=true to play all the same."
+                f"(--topic of hannes play){clock}, or give --beside (beside:=true) to play all the same."
             )
-        return not others
+        return bool(others)
 
     def _others(self) -> dict[str, list[str]]:
         """By topic that is played: the other nodes that publish it."""
+        names = [entry.name for entry in self._topics if entry.name not in _OF_EVERY_NODE]
         others = {}
-        for output in (*self._outputs.values(), *([self._sim_clock] if self._sim_clock else [])):
-            if (topic := output.topic_name) in _OF_EVERY_NODE:
-                continue
+        for topic in (*names, *([topics.CLOCK_TOPIC] if self._p.clock else [])):
             found = [
                 f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-                for info in self.get_publishers_info_by_topic(topic)
+                for info in self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
             ]
-            if (own := self.get_fully_qualified_name()) in found:
+            if self._opened is not None and (own := self.get_fully_qualified_name()) in found:
                 found.remove(own)  # once: another player may have the same name
             if found:
                 others[topic] = sorted(found)

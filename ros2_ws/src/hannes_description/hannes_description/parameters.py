@@ -223,7 +223,7 @@ class _OneOfEach:
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         given: set[tuple[str, str]] = set()
-        for key, _ in node.value:
+        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if isinstance(key, yaml.ScalarNode):
                 if (key.tag, key.value) in given:
                     raise yaml.constructor.ConstructorError(

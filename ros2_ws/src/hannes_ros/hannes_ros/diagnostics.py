@@ -120,6 +120,10 @@ class Rate:
         return rate
 
 
+GAP_S = 0.2
+"""s without a message after which a rate is counted anew: who was away for so long was silent, not slow."""
+
+
 class Arrivals:
     """Rate of the messages of a topic by the times of their arrival, whenever it is looked at."""
 
@@ -130,8 +134,8 @@ class Arrivals:
 
     def came(self, now: float) -> None:
         """A message came at `now` (s, monotonic)."""
-        if self._first is None:
-            self._first = now
+        if self._first is None or now - self._last > GAP_S:
+            self._first, self._count = now, 0  # silence is no slow rate
         else:
             self._count += 1
         self._last = now

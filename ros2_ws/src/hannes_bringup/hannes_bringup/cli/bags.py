@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from hannes_description.errors import HannesError
 
 from .output import JsonOption, print_json
 
@@ -100,8 +101,26 @@ def _record_profile(
                 if len(group.running) < 2:
                     raise typer.Exit(1)
                 time.sleep(0.1)
+            _require_motor_on()
         except Interrupted:
             typer.echo("interrupted: what was recorded is kept", err=True)
+
+
+def _require_motor_on() -> None:
+    """Say of a profile that it was cut short: a controller whose loop pauses switches the motor off, and stays."""
+    from hannes_ros.node import DEFAULT_NAMESPACE
+
+    from hannes_bringup.motor_switch import switch
+
+    try:
+        state = switch(f"/{DEFAULT_NAMESPACE}/motor_controller", None, SEEK)
+    except HannesError:
+        return  # a busy machine; that it runs is known
+    if state != "active":
+        raise HannesError(
+            "The controller switched the motor off before the profile had ended (its log above says why): what came "
+            "before is in the bag; record again."
+        )
 
 
 def play(
