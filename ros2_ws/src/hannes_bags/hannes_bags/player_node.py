@@ -9,6 +9,7 @@ from time import monotonic
 from hannes_description.errors import HannesError
 from hannes_ros import topics
 from hannes_ros.convert import clock_bytes
+from hannes_ros.diagnostics import SAY_AGAIN_S
 from hannes_ros.node import DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
@@ -32,7 +33,6 @@ _ARRIVAL_S = 3.5
 _LOOK_S = 0.1
 _QUIET_S, _LONGEST_S = 0.5, 3.0
 """Others are known when the graph has not changed for the first time, or after the second at the latest."""
-_SAY_AGAIN_S = 5.0
 _DEPTH = 2000
 _OF_EVERY_NODE = ("/rosout", "/parameter_events")
 """What each ROS node publishes."""
@@ -171,7 +171,7 @@ class PlayerNode(HannesNode, Node):
         elif not self._p.beside and (others := self._others()):
             self.get_logger().error(
                 f"Another node publishes what is being played: {_listed(others)}; end one of the two.",
-                throttle_duration_sec=_SAY_AGAIN_S,
+                throttle_duration_sec=SAY_AGAIN_S,
             )
 
     def _refused(self) -> bool:

@@ -30,6 +30,8 @@ _SLOWEST_STATE_HZ = 80.0
 _ANOTHER_CLOCK_S = 0.5
 """Stamps that are so far off, or for so long without a good one between, are of another clock; others are late."""
 _ZERO = convert.float64_bytes(0.0)
+_INPUTS = ("encoder_position", "motor_current", "reference_position")
+_TOPICS = tuple(topics.signal(name).topic for name in _INPUTS)
 
 
 @dataclass(frozen=True)
@@ -132,8 +134,7 @@ class MotorController(HannesNode, LifecycleNode):
         self._loop: RealtimeLoop | None = None
         self._missed = 0
 
-        inputs = ("encoder_position", "motor_current", "reference_position")
-        self._sources = Sources(self, *inputs[: 3 if self._profile is None else 2])
+        self._sources = Sources(self, *_INPUTS[: 3 if self._profile is None else 2])
         self._probe = Probe(self._sources.mixed)
         heard = self._probe.on_match
         self._voltage = topics.publisher(self, "motor_voltage")
@@ -400,7 +401,7 @@ class MotorController(HannesNode, LifecycleNode):
 
     def _on_surplus(self, slot: int) -> None:
         """Messages of another source end the node; what one source repeated too late for `rejoin` is joined anew."""
-        name = ("encoder_position", "motor_current", "reference_position")[slot]
+        name = _INPUTS[slot]
         if slot == 0 and self._join.synchronised:
             name = "motor_voltage"  # somebody else has answered, or the next motor/state would not be there
         if not self._join.synchronised or self._sources.count(name) > 1:
@@ -493,9 +494,8 @@ class MotorController(HannesNode, LifecycleNode):
             return WARN, "not active: motor off" + ("; activate again" if self._tripped else ""), values
         if self._lockstep and (absent := self._peers.missing()):
             return WARN, f"waiting for {', '.join(absent)}", values
-        names = ("motor/state", "motor/current", "reference_position")
         if self._lockstep:
-            missing = [names[slot] for slot in self._join.missing()]
+            missing = [_TOPICS[slot] for slot in self._join.missing()]
             level = WARN if self._state_at and silence({"any message": self._state_at}) else OK
             return (
                 (level, f"waiting for {', '.join(missing)}", values) if missing else (OK, "running", values)
@@ -505,7 +505,7 @@ class MotorController(HannesNode, LifecycleNode):
         absent = [
             name
             for name, value in zip(
-                names,
+                _TOPICS,
                 (self._state, self._current, self._reference if self._profile is None else 0.0),
                 strict=True,
             )

@@ -550,9 +550,8 @@ class Search:
         done = {c.key for c, known in zip(fitted, best, strict=True) if c is not known}
         done |= {c.key for c in ended}
         ranked = sorted(best, key=lambda c: c.penalised)
-        worthy = [
-            c for c in ranked[:POLISH] if c.penalised < self._rivals(ranked, worth) and c.key not in done
-        ]
+        most = self._rivals(ranked, worth)
+        worthy = [c for c in ranked[:POLISH] if c.penalised < most and c.key not in done]
         ranked = self.polished(ranked, worthy, text)
         if not self.slow and ranked and (ranked[0].far_off or ranked[0].penalised >= worth):
             done |= {c.key for c in worthy}
@@ -572,8 +571,7 @@ class Search:
         best = ranked[0]
         if self.slow:
             return min(worth, RIVAL_START * best.penalised)
-        whole = best.fit.cost <= self.problem.features.size and not best.far_off
-        return min(worth, HOPELESS * best.penalised) if whole else worth
+        return min(worth, HOPELESS * best.penalised) if _explains_all(self.problem, best) else worth
 
     def _led_astray(self, base: Candidate) -> bool:
         """True where a base leaves little and is far off: what it takes over fits nearly as well as an effect would."""
@@ -634,8 +632,7 @@ class Search:
         led = next(item for item in items if key_of((*item[0].names, item[1])) == best.key)
         # Where it explains all, others can only tie with it: they move the data alike, and so do their approaches.  Not
         # where it takes a machine far off for that.
-        whole = least <= self.problem.features.size and not best.far_off
-        asked = ALIKE * _gain(led) if whole else -np.inf
+        asked = ALIKE * _gain(led) if _explains_all(self.problem, best) else -np.inf
         return [
             item
             for item in rest
@@ -788,6 +785,11 @@ def _work(
 def _from_far_off(item: _Approached) -> bool:
     """True of an approach from a set of effects that is far off."""
     return bool(item[0].names) and item[0].pulled
+
+
+def _explains_all(problem: Problem, best: Candidate) -> bool:
+    """True of a set that leaves no more than noise, without taking a machine far off for that."""
+    return best.fit.cost <= problem.features.size and not best.far_off
 
 
 def _gain(item: _Approached) -> float:
