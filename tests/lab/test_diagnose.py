@@ -61,8 +61,19 @@ def data(
     return prepare([make_trial(r) for r in recordings], model), truth
 
 
-def run(prepared: Prepared) -> Diagnosis:
-    return diagnose(prepared, effect_sources(model=prepared.model))
+def run(prepared: Prepared, only: Sequence[str] | None = None) -> Diagnosis:
+    return diagnose(prepared, effect_sources(only=only, model=prepared.model))
+
+
+SPRINGS = (
+    *("glove_stiffness", "glove_hysteresis", "return_preload", "wire_elasticity", "wire_slack", "gravity"),
+    *("encoder_offset", "encoder_eccentricity"),
+)
+FRICTIONS = (
+    *("coulomb_friction", "load_dependent_friction", "joint_friction", "velocity_strengthening"),
+    *("stribeck_friction", "presliding_friction", "current_sensor", "winding_heating"),
+)
+"""What looks alike; one effect is sought in the whole catalogue."""
 
 
 @pytest.fixture(scope="module")
@@ -106,18 +117,18 @@ def test_nothing_is_missing_in_clean_data() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "seed", "conditions"),
+    ("name", "seed", "only"),
     [
-        ("glove_stiffness", 102, QUICK),
-        ("gearbox_inertia", 103, QUICK),
-        ("load_dependent_friction", 104, QUICK),
+        ("glove_stiffness", 102, SPRINGS),
+        ("gearbox_inertia", 103, None),
+        ("load_dependent_friction", 104, FRICTIONS),
     ],
 )
 def test_a_hidden_effect_is_named_its_parameter_recovered_and_the_error_falls(
-    name: str, seed: int, conditions: Sequence[str]
+    name: str, seed: int, only: Sequence[str] | None
 ) -> None:
-    prepared, truth = data([name], seed, conditions=conditions)
-    found = run(prepared)
+    prepared, truth = data([name], seed, conditions=QUICK)
+    found = run(prepared, only)
     assert found.verdict == "effects"
     assert [e.name for e in found.effects] == [name]
     assert len(found.tied) <= 2
