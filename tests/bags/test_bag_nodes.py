@@ -8,6 +8,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -19,6 +20,7 @@ import pytest
 from bags.bag_samples import MOTOR, foreign_bag, motor_messages, recording
 from hannes_bags.reading import bag_info, read_bag
 from hannes_bags.recover import recover
+from hannes_bags.storage import BagMessages, locate
 from hannes_bags.writing import write_recording
 from hannes_description.errors import HannesError
 from patience import PATIENCE
@@ -149,6 +151,63 @@ def test_sigterm_closes_the_bag(start: Start, tmp_path: Path, ros_context: Any) 
     node.destroy_node()
 
 
+def test_a_recorder_ends_while_others_go_on_publishing(
+    start: Start, tmp_path: Path, ros_context: Any
+) -> None:
+    child = start("recorder", output=str(tmp_path / "bag"))
+    node, output = publisher(ros_context)
+    settle(lambda: output.get_subscription_count() > 0)
+    over = threading.Event()
+
+    def go_on() -> None:
+        while not over.is_set():
+            drive(output, 0.05)
+
+    other = threading.Thread(target=go_on)
+    other.start()
+    try:
+        settle(lambda: len(written(tmp_path / "bag")) > 10_000)
+        end(child, signal.SIGINT)
+    finally:
+        over.set()
+        other.join()
+    assert read_bag(tmp_path / "bag")["motor_voltage"].values.size > 10
+    node.destroy_node()
+
+
+@pytest.mark.parametrize("clocks", [1, 2])
+def test_the_time_of_another_hand_is_not_that_of_the_recorded_one(
+    start: Start, tmp_path: Path, ros_context: Any, clocks: int
+) -> None:
+    """A hand that runs in real time beside one in lock-step, or two of those."""
+    from hannes_ros import topics
+    from hannes_ros.convert import MOTOR_STATE, clock_bytes
+    from rclpy.node import Node
+
+    node = Node("sim", context=ros_context, namespace="hannes")
+    others = [topics.clock_publisher(node) for _ in range(clocks)]
+    state = topics.publisher(node, "encoder_position")
+    child = start("recorder", output=str(tmp_path / "bag"))
+    settle(lambda: state.get_subscription_count() > 0 and all(o.get_subscription_count() for o in others))
+    stamps = []
+    for k in range(100):
+        for other in others:
+            other.publish(clock_bytes(k * 1_000_000))
+        stamps.append(time.time_ns())
+        state.publish(MOTOR_STATE.encode(stamps[-1], (float(k),), (0.0,), (0.0,)))
+        time.sleep(2e-3)
+    settle(lambda: struct.pack("<d", 99.0) in written(tmp_path / "bag"))
+    output = end(child, signal.SIGINT)
+    assert "/clock is not the time of /hannes/motor/state" in output
+    assert ("2 publishers of /clock; " in output) == (clocks == 2)
+    logged = [
+        log for topic, log, _ in BagMessages(locate(tmp_path / "bag")) if topic == "/hannes/motor/state"
+    ]
+    assert len(logged) == 100
+    assert min(np.array(logged) - stamps) >= 0 and max(np.array(logged) - stamps) < 1_000_000_000
+    node.destroy_node()
+
+
 def test_kill_loses_at_most_200_ms(start: Start, tmp_path: Path, ros_context: Any) -> None:
     """What was published more than 0.2 s before the kill is in the recovered bag, without a gap.
 
@@ -204,6 +263,13 @@ def test_in_lockstep_every_message_has_the_time_of_its_tick(
         reference.publish(number)
         voltage.publish(number)
         time.sleep(2e-4)
+        if tick == 1000:
+            child.send_signal(
+                signal.SIGSTOP
+            )  # as a busy machine does: then /clock waits behind what it is the time of
+        if tick == 1020:
+            time.sleep(0.4)
+            child.send_signal(signal.SIGCONT)
         if tick % 25 == 24:
             # No more at once than a socket holds while its process is kept waiting; all four topics carry the number.
             settle(lambda number=number: written(tmp_path / "bag").count(number[4:]) >= 4)

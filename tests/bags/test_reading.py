@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+import zstandard
 from bags.bag_samples import MOTOR, foreign_bag, motor_messages, recording
 from hannes_bags import cdr
 from hannes_bags.mcap_file import Limits
@@ -72,6 +73,18 @@ def test_a_packed_sqlite_file_is_refused_with_advice(tmp_path: Path) -> None:
         writer.write(connection, 1, cdr.encode_float64([1.0])[0])
     with pytest.raises(HannesError, match="zstd -d"):
         read_bag(tmp_path / "bag")
+    (packed,) = (tmp_path / "bag").glob("*.db3.zstd")
+    with packed.open("rb") as stream:
+        packed.with_suffix("").write_bytes(zstandard.ZstdDecompressor().stream_reader(stream).read())
+    assert read_bag(tmp_path / "bag")["grip_force"].values.tolist() == [1.0]
+    packed.unlink()
+    assert read_bag(tmp_path / "bag")["grip_force"].values.tolist() == [1.0]
+
+
+def test_times_that_a_recorder_had_to_guess_are_said(tmp_path: Path) -> None:
+    path = foreign_bag(tmp_path / "bag", motor_messages(STAMPS), custom={"misplaced_messages": "12"})
+    with pytest.warns(RecordingWarning, match="12 messages count too early"):
+        read_bag(path)
 
 
 def test_any_namespace_and_renamed_topics(tmp_path: Path) -> None:

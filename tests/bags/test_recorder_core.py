@@ -30,7 +30,7 @@ def lockstep_traffic(ticks: int) -> list[Received]:
             ("voltage", number),
         ):
             sent += 10_000
-            messages.append(Received(topic, data, sent, sent + 50_000))
+            messages.append(Received(topic, data, sent, sent + 50_000, sent + 60_000))
     return messages
 
 
@@ -58,18 +58,33 @@ def test_in_lockstep_every_message_gets_the_time_of_its_tick(seed: int) -> None:
 
 def test_without_a_later_clock_a_message_waits_no_longer_than_the_hold() -> None:
     times = SimulatedTimes("/clock", hold_ns=50)
-    times.add(Received("/clock", cdr.encode_clock(np.array([7]))[0], 10, 10))
-    times.add(Received("voltage", b"", 20, 20))
+    times.add(Received("/clock", cdr.encode_clock(np.array([7]))[0], 10, 10, 10))
+    times.add(Received("voltage", b"", 20, 20, 40))
     assert [log for _, log in times.release(30)] == [7]
     assert times.waiting == 1
-    assert [(m.topic, log) for m, log in times.release(71)] == [("voltage", 7)]
+    assert times.release(89) == [], "the recorder was held up, and took it late"
+    assert [(m.topic, log) for m, log in times.release(91)] == [("voltage", 7)]
+    times.add(Received("/clock", cdr.encode_clock(np.array([8]))[0], 30, 95, 95))
+    assert times.misplaced == 0
+
+
+def test_what_was_given_out_before_the_clock_of_its_time_came_is_counted() -> None:
+    times = SimulatedTimes("/clock", hold_ns=50)
+    times.add(Received("/clock", cdr.encode_clock(np.array([7]))[0], 10, 10, 10))
+    for sent in (11, 21, 22):
+        times.add(Received("voltage", b"", sent, sent, sent))
+    assert [log for _, log in times.release(100)] == [7, 7, 7, 7]
+    times.add(Received("/clock", cdr.encode_clock(np.array([8]))[0], 20, 101, 101))
+    assert times.misplaced == 2
+    times.add(Received("/clock", cdr.encode_clock(np.array([9]))[0], 30, 102, 102))
+    assert times.misplaced == 2
 
 
 def test_messages_before_the_first_clock_take_its_time() -> None:
     times = SimulatedTimes("/clock")
-    times.add(Received("emg", b"", 5, 5))
+    times.add(Received("emg", b"", 5, 5, 5))
     assert times.release(10**12) == []
-    times.add(Received("/clock", cdr.encode_clock(np.array([3 * MS]))[0], 10, 10))
+    times.add(Received("/clock", cdr.encode_clock(np.array([3 * MS]))[0], 10, 10, 10))
     assert [log for _, log in times.release(10**12)] == [3 * MS, 3 * MS]
 
 

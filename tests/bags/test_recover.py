@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+import yaml
 from bags.bag_samples import MOTOR, foreign_bag, motor_messages, recording
 from hannes_bags import cdr
 from hannes_bags.cli import info
@@ -212,6 +213,26 @@ def test_what_is_missing_against_metadata_yaml(tmp_path: Path, storage: StorageP
     stale = path / "metadata.yaml"
     stale.write_text(stale.read_text().replace("4000", "7"))
     assert recover(path, tmp_path / "again").recorded == (None if saved.damage else saved.messages)
+
+
+def test_a_file_that_is_missing_in_the_middle_is_named_and_so_is_the_hole(tmp_path: Path) -> None:
+    path = tmp_path / "bag"
+    path.mkdir()
+    for k, part in enumerate(np.array_split(STAMPS, 4)):
+        foreign_bag(tmp_path / "part", motor_messages(part), StoragePlugin.MCAP)
+        (file,) = (tmp_path / "part").glob("*.mcap")
+        file.rename(path / f"bag_{k}.mcap")
+        information = yaml.safe_load((tmp_path / "part" / "metadata.yaml").read_text())
+        shutil.rmtree(tmp_path / "part")
+    told = information["rosbag2_bagfile_information"]
+    told["relative_file_paths"] = [f"bag_{k}.mcap" for k in range(4)]
+    told["message_count"] = 4000
+    (path / "metadata.yaml").write_text(yaml.safe_dump(information))
+    (path / "bag_2.mcap").unlink()
+    saved = recover(path, tmp_path / "saved")
+    assert saved.messages == 3000 and saved.damage == ("bag_2.mcap is missing.",)
+    assert saved.gap == pytest.approx((1.0 - 0.001, 1.5), abs=1.1e-3)
+    assert saved.losses.endswith("without a message is from 0.999 to 1.500 s")
 
 
 # ---- commands -----------------------------------------------------------------------------------------------------

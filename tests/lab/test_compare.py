@@ -39,6 +39,13 @@ def test_there_is_contact_where_the_dynamometer_shows_more_than_it_does_at_rest(
     assert not presses or touched.min() == pytest.approx(8.6, abs=0.7)
 
 
+def test_without_position_current_and_force_there_are_no_figures_of_the_thesis() -> None:
+    recordings, _ = make_set(Model.load(), [], seed=5, closures=3, conditions=("fast",), sensors="bench")
+    prepared = prepare([make_trial(recordings[0])], Model.load(), signals=["motor_voltage"])
+    found = compare(prepared)
+    assert found.metrics == () and {cell.signal for cell in found.cells} == {"motor_voltage"}
+
+
 def test_an_offset_depends_on_nothing_and_without_an_encoder_place_and_speed_are_unknown(
     empty: Trial,
 ) -> None:

@@ -508,6 +508,12 @@ class _Reader:
         sha256: str,
     ) -> Recording:
         start = min(int(times[0]) for times, _ in samples.values())
+        misplaced = self.messages.metadata.get("misplaced_messages")
+        if isinstance(misplaced, int) and misplaced:
+            self.warnings.append(
+                f"{misplaced} messages count too early: the recorder had no simulated time for them in time; signals "
+                "without a header (all but encoder_position) may be shifted."
+            )
         stored = self.messages.metadata.get("start_ns")
         if isinstance(stored, int) and not isinstance(stored, bool) and 0 <= start - stored < 10**15:
             start = stored
@@ -523,8 +529,8 @@ class _Reader:
             "storage": self.messages.bag.storage,
             "files": [file.name for file in self.messages.bag.files],
             "messages": sum(self.messages.counts.values()),
-            "topics": {name: chosen[name] for name in channels},
-            "unread": {n: t for n, t in self.messages.types.items() if n not in chosen.values()},
+            "topics": (read := {name: chosen[name] for name in channels}),
+            "unread": {n: t for n, t in self.messages.types.items() if n not in read.values()},
         }
         metadata["clock"] = {
             "kind": relation.kind,

@@ -5,7 +5,8 @@ wrong by as much as the recorder lags behind, and in lock-step, where thousands 
 many ticks; and the Float64 topics carry no stamp of their own. What orders the messages of all publishers on
 one host is the time at which each was sent (the middleware's source timestamp). So a message counts at the
 simulated time that held when it was sent: that of the latest /clock sent no later. In lock-step, where each tick
-begins with /clock and is complete before the next begins, every message so gets exactly the time of its tick.
+begins with /clock and is complete before the next begins, every message so gets exactly the time of its tick. That
+/clock may come after the message, if it was lost and sent again; what was given out without it is counted.
 """
 
 from __future__ import annotations
@@ -24,12 +25,14 @@ _CLOCKS_KEPT = 100_000
 
 @dataclass(frozen=True)
 class Received:
-    """One serialised message and its times, ns: sent (by the publisher's clock) and received (by ours)."""
+    """One serialised message and its times, ns: sent (by the publisher's clock), received by the middleware, and taken
+    from it, which a recorder that was held up does late."""
 
     topic: str
     data: bytes
     sent_ns: int
     received_ns: int
+    taken_ns: int
 
 
 @dataclass
@@ -37,12 +40,15 @@ class SimulatedTimes:
     """Gives messages the simulated time that held when they were sent.
 
     clock_topic  topic of simulated time
-    hold_ns      a message waits for the /clock after it at most this long (by `received_ns`); it bounds what a
+    hold_ns      a message waits for the /clock after it at most this long (by `taken_ns`); it bounds what a
                  kill can take
+    misplaced    messages that were given out before a /clock came that had been sent before them: they count too early
     """
 
     clock_topic: str
-    hold_ns: int = 50_000_000
+    hold_ns: int = 150_000_000
+    misplaced: int = 0
+    _guessed: list[int] = field(default_factory=list)
     _waiting: list[Received] = field(default_factory=list)
     _sent: list[int] = field(default_factory=list)
     _values: list[int] = field(default_factory=list)
@@ -54,6 +60,8 @@ class SimulatedTimes:
             place = bisect_right(self._sent, message.sent_ns)
             self._sent.insert(place, message.sent_ns)
             self._values.insert(place, value)
+            self.misplaced += sum(sent >= message.sent_ns for sent in self._guessed)
+            self._guessed.clear()
 
     @property
     def waiting(self) -> int:
@@ -62,7 +70,7 @@ class SimulatedTimes:
     def release(self, now_ns: int, *, everything: bool = False) -> list[tuple[Received, int]]:
         """Messages whose time is known, with it (ns), in the order in which they were sent.
 
-        now_ns      what was received more than `hold_ns` before is given out with the latest time known
+        now_ns      what was taken more than `hold_ns` before is given out with the latest time known
         everything  at the end of the recording
         """
         if not self._sent and not everything:
@@ -71,8 +79,11 @@ class SimulatedTimes:
         ready: list[Received] = []
         waiting: list[Received] = []
         for message in self._waiting:
-            known = everything or message.sent_ns <= latest or message.received_ns <= deadline
-            (ready if known else waiting).append(message)
+            known = everything or message.sent_ns <= latest
+            given_up = not known and message.taken_ns <= deadline
+            (ready if known or given_up else waiting).append(message)
+            if given_up:
+                self._guessed.append(message.sent_ns)
         self._waiting = waiting
         ready.sort(key=lambda message: (message.sent_ns, message.topic != self.clock_topic))
         timed = [(message, self._time_of(message)) for message in ready]
@@ -131,10 +142,15 @@ class Recorder:
         if self.simulated is None:
             self.writer.write(topic, data, received, sent)
         else:
-            self.simulated.add(Received(topic, data, sent, received))
+            self.simulated.add(Received(topic, data, sent, received, now_ns))
+
+    @property
+    def misplaced(self) -> int:
+        """Messages whose log time is too early, because /clock came later than they were held for."""
+        return 0 if self.simulated is None else self.simulated.misplaced
 
     def hand_over(self, now_ns: int) -> None:
-        """Give everything whose time is known to the operating system."""
+        """Give everything whose time is known to the operating system; what came in up to now_ns was taken."""
         self._write(now_ns, everything=False)
         self.writer.flush()
 
@@ -145,10 +161,11 @@ class Recorder:
             self.simulated = None
 
     def close(self, now_ns: int) -> None:
-        """Write what is left and close the bag; losses are kept in its metadata."""
+        """Write what is left and close the bag; losses and wrong times are kept in its metadata."""
         self._write(now_ns, everything=True)
         lost = {topic: count for topic, count in sorted(self.losses.lost.items()) if count}
-        self.writer.close({"lost_messages": lost} if lost else {})
+        entries = {"lost_messages": lost, "misplaced_messages": self.misplaced}
+        self.writer.close({name: entry for name, entry in entries.items() if entry})
 
     def _write(self, now_ns: int, *, everything: bool, received: bool = False) -> None:
         if self.simulated is not None:

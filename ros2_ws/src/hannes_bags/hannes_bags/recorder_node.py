@@ -17,17 +17,21 @@ from hannes_description.signals import SIGNALS
 from hannes_ros.node import DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
+from hannes_ros.sources import Sources
 from hannes_ros.topics import CLOCK_TOPIC, DIAGNOSTICS_TOPIC
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
+from .cdr import stamp_at
 from .recorder import Recorder, SimulatedTimes
 from .writing import BagWriter, Qos
 
 _POLL_S = 0.004
 _LOOK_S = 0.05
 _SYNC_S = 1.0
+_STOP_S = 0.5
+_OWN_CLOCK_NS = 1_000_000_000
 _DEPTH = 4000
 _MOST_AT_ONCE = 5000
 _LEADING = SIGNALS["encoder_position"].topic
@@ -128,6 +132,7 @@ class RecorderNode(HannesNode, Node):
         self._health = self.resolve_topic_name(DIAGNOSTICS_TOPIC)
         self._decided = p.clock != "auto"
         self._simulated = p.clock != "computer"
+        self._clocks = Sources(self, CLOCK_TOPIC, rule="time is told by one hand in lock-step, or one player")
         if p.clock == "auto" and self.get_parameter("use_sim_time").value:
             self._decided = True
         self._seen_at: float | None = None
@@ -149,6 +154,8 @@ class RecorderNode(HannesNode, Node):
         """Subscribe to what there is; the leading topic last, since in lock-step it starts the run."""
         if not self._decided:
             self._decide()
+        if self._simulated:
+            self._clocks.several()
         for topic, msgtype in self._wanted.items():
             if topic == self._leading and not self._may_lead():
                 continue
@@ -240,10 +247,12 @@ class RecorderNode(HannesNode, Node):
                 message = handle.take_message(kind, True)
             if message is None:
                 return count
+            data, info = message
             if topic not in self._begun:
                 self._begin(topic)
+                if topic == self._leading:
+                    self._check_stamp(data, info.get("source_timestamp") or time.time_ns())
             assert self._recorder is not None
-            data, info = message
             self._recorder.take(topic, data, info, time.time_ns())
         return _MOST_AT_ONCE
 
@@ -258,6 +267,22 @@ class RecorderNode(HannesNode, Node):
         self._recorder.writer.add_topic(topic, msgtype, qos=self._offered(topic))
         self._begun.add(topic)
 
+    def _check_stamp(self, data: bytes, sent_ns: int) -> None:
+        """Who stamps by the computer's clock does not live by the /clock that another hand publishes."""
+        stamp, chosen = (
+            stamp_at(data),
+            self._p.clock == "auto" and not self.get_parameter("use_sim_time").value,
+        )
+        if not (chosen and self._simulated) or stamp is None or abs(sent_ns - stamp) > _OWN_CLOCK_NS:
+            return
+        assert self._recorder is not None
+        self._simulated = False
+        self._recorder.use_receive_times(time.time_ns())
+        self.get_logger().warning(
+            f"{self._clock} is not the time of {self._leading}, which is stamped by the computer's clock: "
+            "log times are those of reception"
+        )
+
     def _offered(self, topic: str) -> Qos:
         for info in self.get_publishers_info_by_topic(topic):
             profile = info.qos_profile
@@ -267,8 +292,10 @@ class RecorderNode(HannesNode, Node):
     def _flush(self) -> None:
         if self._recorder is None:
             return
+        now_ns = time.time_ns()
+        self._poll()  # where this process was held up, /clock waits behind the messages of its time
         try:
-            self._recorder.hand_over(time.time_ns())
+            self._recorder.hand_over(now_ns)
         except HannesError as error:
             self.fail(error)
 
@@ -279,8 +306,12 @@ class RecorderNode(HannesNode, Node):
                 self._recorder.writer.sync()
 
     def stop(self) -> None:
-        """Take what is still on its way, close the bag, tell what is in it."""
-        while self.failure is None and self._poll():
+        """Take what is still on its way, close the bag, tell what is in it.
+
+        Nodes that go on publishing do not hold the end up: one poll takes all that had come in before it.
+        """
+        until = time.monotonic() + _STOP_S
+        while self.failure is None and self._poll() and time.monotonic() < until:
             time.sleep(0.02)
         self._stop_sync.set()
         if self._sync.is_alive():
@@ -300,6 +331,11 @@ class RecorderNode(HannesNode, Node):
         lost: Mapping[str, int] = recorder.losses.lost
         if lost:
             self.get_logger().warning(f"messages that never arrived: {dict(lost)}")
+        if recorder.misplaced:
+            self.get_logger().warning(
+                f"{recorder.misplaced} messages count too early: {self._clock} came more than "
+                f"{SimulatedTimes.hold_ns * 1e-6:.0f} ms after them. Do not use the log times of what has no header."
+            )
         self.get_logger().info(f"{recorder.writer.message_count} messages in {self._p.output}")
 
 

@@ -53,6 +53,7 @@ class Recovery:
     lost_s           the lost tail, s: up to the end that metadata.yaml tells of; else an estimate, unread bytes at
                      the mean rate of the rest (what the recorder had not handed over yet, at most 0.2 s, comes on
                      top, and what lay behind a cut is not known)
+    gap              first and last second, from the beginning on, of the longest time without a message
     damage           what was wrong, as sentences; empty if only metadata.yaml was missing
     """
 
@@ -66,6 +67,7 @@ class Recovery:
     unread_bytes: int
     recorded: int | None
     lost_s: float
+    gap: tuple[float, float]
     damage: tuple[str, ...]
 
     @property
@@ -84,7 +86,11 @@ class Recovery:
         if self.recorded == self.messages:
             return "no message is missing"
         missing = self.recorded - self.messages
-        return f"{missing} of {self.recorded} messages are missing, about {self.lost_s:.3f} s at the end"
+        begin, end = self.gap
+        return (
+            f"{missing} of {self.recorded} messages are missing, about {self.lost_s:.3f} s at the end; "
+            f"the longest time without a message is from {begin:.3f} to {end:.3f} s"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-like."""
@@ -143,10 +149,11 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
             salvage.metadata.update(decode_entries(information.get("custom_data")))
         except HannesError as error:
             salvage.damage.append(str(error).split(" Run `")[0])
+    salvage.damage.extend(f"{name} is missing." for name in _missing(information, path))
     _gather_metadata(files, salvage)
     writer: BagWriter | None = None
     counts: dict[str, int] = {}
-    first, last = 2**63, 0
+    first, last, gap = 2**63, 0, (0, 0)
     try:
         for topic, log_ns, data in _messages(files, salvage):
             if writer is None:
@@ -156,6 +163,8 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
                 _announce(writer, topic, salvage.definitions[topic])
             writer.write(topic, data, log_ns)
             counts[topic] += 1
+            if last and log_ns - last > gap[1] - gap[0]:
+                gap = (last, log_ns)
             first, last = min(first, log_ns), max(last, log_ns)
     except OSError as error:
         raise HannesError(f"Cannot recover {path}: {error.strerror or error}.") from None
@@ -185,8 +194,16 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
         unread_bytes=salvage.unread_bytes,
         recorded=recorded,
         lost_s=max(0, end - last) * 1e-9,
+        gap=((gap[0] - first) * 1e-9, (gap[1] - first) * 1e-9) if gap[0] else (0.0, 0.0),
         damage=tuple(salvage.damage),
     )
+
+
+def _missing(information: Mapping[str, Any], folder: Path) -> list[str]:
+    """Files that metadata.yaml names and that are not there."""
+    names = information.get("relative_file_paths")
+    told = [Path(name).name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    return [name for name in told if not (folder / name).exists()]
 
 
 def _told(information: Mapping[str, Any], kept: int) -> tuple[int | None, int | None]:

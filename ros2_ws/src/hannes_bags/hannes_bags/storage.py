@@ -72,6 +72,10 @@ class BagFiles:
         mode = str(self.yaml.get("compression_mode") or "").lower()
         return "" if mode == "none" else mode
 
+    def packed(self, file: Path) -> bool:
+        """Whether that file is packed as a whole; one that was unpacked beside it is not."""
+        return self.compression == "file" and file.suffix not in _STORAGE
+
     def sha256(self) -> str:
         """SHA-256 over the bytes of the storage files, in order."""
         digest = hashlib.sha256()
@@ -152,6 +156,12 @@ def _locate_folder(path: Path) -> BagFiles:
         # Before version 4 the paths were relative to the folder that holds the bag's folder.
         relative = pure.name if isinstance(version, int) and version < 4 else name
         file = path / relative
+        if (
+            file.suffix == ".zstd"
+            and file.with_suffix("").suffix in _STORAGE
+            and file.with_suffix("").exists()
+        ):
+            file = file.with_suffix("")
         _inside(path, name, file)
         if file in files:
             raise HannesError(f"{metadata_path}: relative_file_paths names {name!r} twice.")
@@ -305,7 +315,7 @@ class BagMessages:
             self.qos[topic] = qos
 
     def _mcap(self, path: Path) -> Iterator[tuple[str, int, bytes | memoryview]]:
-        with _mapped(path, self.bag.compression == "file", self.limits) as buffer:
+        with _mapped(path, self.bag.packed(path), self.limits) as buffer:
             scan = McapScan(buffer, self.limits)
             topics: dict[int, str] = {}
             try:
@@ -333,7 +343,7 @@ class BagMessages:
         )
 
     def _sqlite(self, path: Path) -> Iterator[tuple[str, int, bytes | memoryview]]:
-        if self.bag.compression == "file":
+        if self.bag.packed(path):
             raise HannesError(
                 f"{path}: decompress it first (`zstd -d`): a packed SQLite file cannot be read in place."
             )

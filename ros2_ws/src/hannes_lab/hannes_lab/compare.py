@@ -336,7 +336,7 @@ def _metrics(
         sets = []
         for source in (measured_all, predicted):
             parts = [curves(s, source) for s in ("encoder_position", "motor_current", "grip_force")]
-            n = next(p.shape[0] for p in parts if p is not None)
+            n = max((p.shape[0] for p in parts if p is not None), default=0)
             sets.append(
                 [
                     metrics(phase, label, *(None if p is None else p[min(k, p.shape[0] - 1)] for p in parts))

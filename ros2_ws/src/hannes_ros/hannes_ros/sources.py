@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rclpy.node import Node
 
-from .topics import signal
+from .topics import CLOCK_TOPIC, signal
 
 _LOG_S = 30.0
 
@@ -12,7 +12,7 @@ _LOG_S = 30.0
 class Sources:
     """Counts the publishers of the inputs of a node.
 
-    names  signals that the node hears
+    names  signals that the node hears, or CLOCK_TOPIC
     rule   what holds for them, the end of the report
     A node that was killed counts until the middleware forgets it, some 20 s later.
     """
@@ -22,7 +22,7 @@ class Sources:
 
     def count(self, name: str) -> int:
         """How many publishers the topic of that signal has."""
-        return self._node.count_publishers(self._node.resolve_topic_name(signal(name).topic))
+        return self._node.count_publishers(self._node.resolve_topic_name(_topic(name)))
 
     def mixed(self) -> bool:
         """Whether an input has more than one publisher."""
@@ -31,7 +31,7 @@ class Sources:
     def several(self) -> str | None:
         """What to report of inputs with more than one publisher, logged too; None where each has one at most."""
         counts = {name: self.count(name) for name in self._names}
-        mixed = [f"{n} publishers of {signal(name).topic}" for name, n in counts.items() if n > 1]
+        mixed = [f"{n} publishers of {_topic(name)}" for name, n in counts.items() if n > 1]
         if not mixed:
             return None
         text = f"{', '.join(mixed)}; {self._rule}"
@@ -47,3 +47,7 @@ class Sources:
             "others (a bag that is played, ros2 topic pub, a second graph; a node that was killed counts for 20 s), "
             "give every node clock:=lockstep and the same rate and period, and start the graph again."
         )
+
+
+def _topic(name: str) -> str:
+    return name if name == CLOCK_TOPIC else signal(name).topic
