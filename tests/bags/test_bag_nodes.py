@@ -239,21 +239,24 @@ def test_kill_loses_at_most_200_ms(start: Start, tmp_path: Path, ros_context: An
     node.destroy_node()
 
 
+LOCKSTEP = ("motor_current", "encoder_position", "reference_position", "motor_voltage")
+
+
+@pytest.mark.parametrize("named", [False, True])
 def test_in_lockstep_every_message_has_the_time_of_its_tick(
-    start: Start, tmp_path: Path, ros_context: Any
+    start: Start, tmp_path: Path, ros_context: Any, named: bool
 ) -> None:
-    """Header-less messages too, though thousands of ticks pass in a second and none is missing from the first on."""
+    """Header-less messages too, though thousands of ticks pass in a second and none is missing from the first on; and
+    where topics are named, /clock not among them."""
     from hannes_ros import topics
     from hannes_ros.convert import MOTOR_STATE, clock_bytes, float64_bytes
     from rclpy.node import Node
 
-    child = start("recorder", output=str(tmp_path / "bag"))
+    only = {"topics": [topics.signal(name).topic for name in LOCKSTEP]} if named else {}
+    child = start("recorder", output=str(tmp_path / "bag"), **only)
     node = Node("sim", context=ros_context, namespace="hannes")
     clock = topics.clock_publisher(node)
-    current, state, reference, voltage = (
-        topics.publisher(node, name)
-        for name in ("motor_current", "encoder_position", "reference_position", "motor_voltage")
-    )
+    current, state, reference, voltage = (topics.publisher(node, name) for name in LOCKSTEP)
     settle(lambda: state.get_subscription_count() > 0)
     for tick in range(2000):
         stamp, number = tick * 1_000_000, float64_bytes(float(tick))
@@ -264,9 +267,8 @@ def test_in_lockstep_every_message_has_the_time_of_its_tick(
         voltage.publish(number)
         time.sleep(2e-4)
         if tick == 1000:
-            child.send_signal(
-                signal.SIGSTOP
-            )  # as a busy machine does: then /clock waits behind what it is the time of
+            # as a busy machine does: then /clock waits behind what it is the time of
+            child.send_signal(signal.SIGSTOP)
         if tick == 1020:
             time.sleep(0.4)
             child.send_signal(signal.SIGCONT)
@@ -276,7 +278,8 @@ def test_in_lockstep_every_message_has_the_time_of_its_tick(
     output = end(child, signal.SIGINT)
     back = read_bag(tmp_path / "bag")
     assert back.start_ns == 0, output
-    for name in ("motor_current", "encoder_position", "reference_position", "motor_voltage"):
+    assert ("/clock" in {entry.name for entry in bag_info(tmp_path / "bag").topics}) != named
+    for name in LOCKSTEP:
         assert back[name].values.tolist() == np.arange(2000).tolist(), output
         assert np.array_equal(back[name].time, np.arange(2000) / 1e3)
     node.destroy_node()

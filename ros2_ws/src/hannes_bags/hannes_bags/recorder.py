@@ -56,12 +56,26 @@ class SimulatedTimes:
     def add(self, message: Received) -> None:
         """A message came in."""
         self._waiting.append(message)
-        if message.topic == self.clock_topic and (value := stamp_at(message.data)) is not None:
-            place = bisect_right(self._sent, message.sent_ns)
-            self._sent.insert(place, message.sent_ns)
-            self._values.insert(place, value)
-            self.misplaced += sum(sent >= message.sent_ns for sent in self._guessed)
-            self._guessed.clear()
+        if message.topic == self.clock_topic:
+            self.heard(message.data, message.sent_ns)
+
+    def heard(self, clock: bytes, sent_ns: int) -> None:
+        """A message of /clock came in, which alone is not to be recorded."""
+        value = stamp_at(clock)
+        if value is None:
+            return
+        place = bisect_right(self._sent, sent_ns)
+        self._sent.insert(place, sent_ns)
+        self._values.insert(place, value)
+        self.misplaced += sum(sent >= sent_ns for sent in self._guessed)
+        self._guessed.clear()
+        if len(self._sent) > 2 * _CLOCKS_KEPT:
+            del self._sent[:_CLOCKS_KEPT], self._values[:_CLOCKS_KEPT]
+
+    @property
+    def known(self) -> bool:
+        """Whether a /clock has come."""
+        return bool(self._sent)
 
     @property
     def waiting(self) -> int:
@@ -86,10 +100,7 @@ class SimulatedTimes:
                 self._guessed.append(message.sent_ns)
         self._waiting = waiting
         ready.sort(key=lambda message: (message.sent_ns, message.topic != self.clock_topic))
-        timed = [(message, self._time_of(message)) for message in ready]
-        if len(self._sent) > 2 * _CLOCKS_KEPT:
-            del self._sent[:_CLOCKS_KEPT], self._values[:_CLOCKS_KEPT]
-        return timed
+        return [(message, self._time_of(message)) for message in ready]
 
     def _time_of(self, message: Received) -> int:
         if not self._sent:

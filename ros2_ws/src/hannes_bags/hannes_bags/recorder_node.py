@@ -31,6 +31,7 @@ _POLL_S = 0.004
 _LOOK_S = 0.05
 _SYNC_S = 1.0
 _STOP_S = 0.5
+_LATE_S = 2.0
 _OWN_CLOCK_NS = 1_000_000_000
 _DEPTH = 4000
 _MOST_AT_ONCE = 5000
@@ -130,6 +131,10 @@ class RecorderNode(HannesNode, Node):
         self._subscriptions_by_topic: dict[str, Subscription] = {}
         self._clock = self.resolve_topic_name(CLOCK_TOPIC)
         self._health = self.resolve_topic_name(DIAGNOSTICS_TOPIC)
+        self._times = SimulatedTimes(self._clock)
+        self._only_heard = self._clock not in self._wanted and p.clock != "computer"
+        if self._only_heard:
+            self._wanted[self._clock] = _TYPES[CLOCK_TOPIC]
         self._decided = p.clock != "auto"
         self._simulated = p.clock != "computer"
         self._clocks = Sources(self, CLOCK_TOPIC, rule="time is told by one hand in lock-step, or one player")
@@ -139,6 +144,7 @@ class RecorderNode(HannesNode, Node):
         self._settled_at: float | None = None
         self._leading_at = 0.0
         self._matched = 0
+        self._late_at = 0.0
         self._recorder: Recorder | None = None
         self._begun: set[str] = set()
         self._stop_sync = threading.Event()
@@ -147,7 +153,7 @@ class RecorderNode(HannesNode, Node):
         self.wall_timer(_LOOK_S, self._look)
         self.wall_timer(_POLL_S, self._listen)
         self.wall_timer(p.flush_ms / 1e3, self._flush)
-        self.get_logger().info(f"recording {len(self._wanted)} topics into {p.output}")
+        self.get_logger().info(f"recording {len(names)} topics into {p.output}")
 
     # -- subscriptions ---------------------------------------------------------------------------------------------
     def _look(self) -> None:
@@ -156,6 +162,11 @@ class RecorderNode(HannesNode, Node):
             self._decide()
         if self._simulated:
             self._clocks.several()
+            if self._recorder is not None and not self._times.known and time.monotonic() > self._late_at:
+                self.get_logger().warning(
+                    f"waiting for {self._clock}: until it comes, nothing is written (clock:=computer does without)",
+                    throttle_duration_sec=10.0,
+                )
         for topic, msgtype in self._wanted.items():
             if topic == self._leading and not self._may_lead():
                 continue
@@ -248,6 +259,9 @@ class RecorderNode(HannesNode, Node):
             if message is None:
                 return count
             data, info = message
+            if topic == self._clock and self._only_heard:
+                self._times.heard(data, info.get("source_timestamp") or time.time_ns())
+                continue
             if topic not in self._begun:
                 self._begin(topic)
                 if topic == self._leading:
@@ -262,8 +276,9 @@ class RecorderNode(HannesNode, Node):
         assert msgtype is not None
         if self._recorder is None:
             writer = BagWriter(self._p.output, self._p.entries(), compression=self._p.compression)  # type: ignore[arg-type]
-            self._recorder = Recorder(writer, SimulatedTimes(self._clock) if self._simulated else None)
+            self._recorder = Recorder(writer, self._times if self._simulated else None)
             self._sync.start()
+            self._late_at = time.monotonic() + _LATE_S
         self._recorder.writer.add_topic(topic, msgtype, qos=self._offered(topic))
         self._begun.add(topic)
 

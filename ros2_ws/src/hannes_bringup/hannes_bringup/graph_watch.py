@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,18 +13,24 @@ from diagnostic_msgs.msg import DiagnosticArray
 from hannes_description.errors import HannesError
 from hannes_description.signals import SIGNALS
 from hannes_ros.node import DEFAULT_NAMESPACE
+from hannes_ros.topics import DIAGNOSTICS_TOPIC
 from rclpy.context import Context
 from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
+from std_msgs.msg import Float64
 
 from .visitor import visit
 
 QUIET, LONGEST = 0.5, 3.0
 """s: discovery is over when no topic or node was added for QUIET, or after LONGEST."""
 HAND = f"/{DEFAULT_NAMESPACE}/{SIGNALS['encoder_position'].topic}"
+REFERENCE = f"/{DEFAULT_NAMESPACE}/{SIGNALS['reference_position'].topic}"
+BEGINS, STANDS, REST = 15.0, 5.0, 1.5
+"""s: a profile begins within BEGINS, stands for no longer than STANDS, and is followed for REST more."""
 HIDDEN = ("/parameter_events", "/rosout")
 LEVELS = {b"\x00": "ok", b"\x01": "warn", b"\x02": "error", b"\x03": "stale"}
 
@@ -98,6 +105,54 @@ def require_hand(timeout: float) -> None:
                     "board, running? (`hannes run hand_sim` starts one.)"
                 )
             _spin(executor, 0.05)
+
+
+def follow_profile(seconds: float, running: Callable[[], bool]) -> None:
+    """Return when the controller has played its profile of so many seconds and the hand has come to rest, or when
+    `running` is no longer true.
+
+    Looks at what has come, instead of at each message: the control loop beside it needs the machine.
+    Raises HannesError where the profile does not begin, or stands: with what the controller says of itself.
+    """
+    with visit("profile", EventsExecutor) as (node, _):
+        reference = node.create_subscription(Float64, REFERENCE, _never_called, _listener_qos(1), raw=True)
+        said = node.create_subscription(
+            DiagnosticArray, DIAGNOSTICS_TOPIC, _never_called, _listener_qos(), raw=True
+        )
+        played, health = 0.0, "nothing"
+        before = last = time.monotonic()
+        while running():
+            time.sleep(0.1)
+            now = time.monotonic()
+            if _taken(reference):
+                played, last = played + now - before, now
+            before = now
+            told = _health(_taken(said)).items()
+            health = next((what for who, what in told if who.endswith("motor_controller")), health)
+            if played >= seconds + REST:
+                return
+            if now - last > (STANDS if played else BEGINS):
+                what = (
+                    f"stands after {played:.1f} of {seconds:.1f} s, and has not gone on for {STANDS:.0f} s"
+                    if played
+                    else f"did not begin within {BEGINS:.0f} s"
+                )
+                raise HannesError(
+                    f'The profile {what}; the controller says "{health}". What came is in the bag; record again.'
+                )
+
+
+def _taken(subscription: Subscription) -> list[bytes]:
+    """The serialised messages that have come since the last time."""
+    messages, handle = [], subscription.handle
+    with handle:
+        while (message := handle.take_message(subscription.msg_type, True)) is not None:
+            messages.append(message[0])
+    return messages
+
+
+def _never_called(data: bytes) -> None:
+    raise AssertionError("the node is in no executor that spins")
 
 
 def _watch(node: Node, executor: Executor, window: float) -> GraphSeen:
@@ -196,10 +251,10 @@ def message_class(kind: str) -> Any | None:
         return None
 
 
-def _listener_qos() -> QoSProfile:
+def _listener_qos(depth: int = 1000) -> QoSProfile:
     # matches every publisher: best effort and volatile are the least that can be asked for
     return QoSProfile(
-        depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
+        depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
     )
 
 

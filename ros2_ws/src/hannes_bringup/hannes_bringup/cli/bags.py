@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from hannes_description.errors import HannesError
 
 from .output import JsonOption, print_json
 
@@ -58,16 +57,12 @@ def record(
 
 SEEK = 5.0
 """s in which a hand that runs is found."""
-SETTLE = 3.0
-"""s in which recorder and controller find the hand before, and in which the last messages come in after a profile."""
 
 
 def _record_profile(
     recorder: dict[str, Any], profile: str, closures: int, period: float, amplitude: float, more: list[str]
 ) -> None:
     """Recorder and controller as child processes for as long as the profile lasts."""
-    import time
-
     from hannes_control.reference import check_travel, make_profile
     from hannes_description.model import Model
 
@@ -84,7 +79,7 @@ def _record_profile(
     controller |= {f"reference_{name}": value for name, value in given.items()}
     require_ros()
     apply_ros_environment()
-    from hannes_bringup.graph_watch import require_hand
+    from hannes_bringup.graph_watch import follow_profile, require_hand
 
     require_hand(SEEK)
     environment = ros_environment()
@@ -96,31 +91,11 @@ def _record_profile(
                 ("motor_controller", _words(controller, [])),
             ):
                 group.start(name, [*find_command(NODES[name], name, environment), *words])
-            end = time.monotonic() + SETTLE + seconds
-            while time.monotonic() < end:
-                if len(group.running) < 2:
-                    raise typer.Exit(1)
-                time.sleep(0.1)
-            _require_motor_on()
+            follow_profile(seconds, lambda: len(group.running) == 2)
+            if len(group.running) < 2:
+                raise typer.Exit(1)
         except Interrupted:
             typer.echo("interrupted: what was recorded is kept", err=True)
-
-
-def _require_motor_on() -> None:
-    """Say of a profile that it was cut short: a controller whose loop pauses switches the motor off, and stays."""
-    from hannes_ros.node import DEFAULT_NAMESPACE
-
-    from hannes_bringup.motor_switch import switch
-
-    try:
-        state = switch(f"/{DEFAULT_NAMESPACE}/motor_controller", None, SEEK)
-    except HannesError:
-        return  # a busy machine; that it runs is known
-    if state != "active":
-        raise HannesError(
-            "The controller switched the motor off before the profile had ended (its log above says why): what came "
-            "before is in the bag; record again."
-        )
 
 
 def play(

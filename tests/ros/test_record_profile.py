@@ -1,0 +1,86 @@
+"""`hannes record --profile`: the whole profile is in the bag, or it is said why not."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from graph import NodeProcess, Peer, processes
+from hannes_bags.reading import read_bag
+from hannes_bringup import graph_watch
+from hannes_bringup.graph_watch import follow_profile
+from hannes_description.errors import HannesError
+from hannes_ros import convert
+from patience import PATIENCE
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.filterwarnings("ignore::hannes_bags.reading.RecordingWarning"),
+]
+
+
+@contextmanager
+def hand(peer: Peer, seconds: float) -> Iterator[None]:
+    """The peer as a hand that rests, for so many seconds."""
+    over = threading.Event()
+
+    def live() -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not over.is_set():
+            peer.say("encoder_position", convert.MOTOR_STATE.encode(time.time_ns(), (0.0,), (0.0,), (0.0,)))
+            peer.say("motor_current", convert.float64_bytes(0.0))
+            time.sleep(5e-3)
+
+    other = threading.Thread(target=live)
+    other.start()
+    try:
+        yield
+    finally:
+        over.set()
+        other.join()
+
+
+def test_a_profile_is_recorded_to_its_end(
+    tmp_path: Path, peer: Peer, ros_environment: dict[str, str]
+) -> None:
+    """Again where a busy machine lets the controller pause, which switches the motor off."""
+    with hand(peer, PATIENCE):
+        for attempt in range(4):
+            bag = tmp_path / f"bag{attempt}"
+            words = ("record", str(bag), "--profile", "half_sine", "--closures", "1", "--period", "2")
+            told = subprocess.run(
+                [sys.executable, "-m", "hannes_bringup.cli", *words],
+                env=ros_environment, capture_output=True, text=True, timeout=PATIENCE,
+            )  # fmt: skip
+            if told.returncode == 0:
+                break
+            assert 'of 2.0 s, and has not gone on for 5 s; the controller says "' in told.stderr
+    assert told.returncode == 0, told.stderr
+    reference = read_bag(bag)["reference_position"]
+    assert reference.values.max() > 14.0 and reference.values[-1] == 0.0
+    assert reference.time[-1] - reference.time[0] > 2.0
+
+
+def test_what_a_profile_waits_for_is_said(peer: Peer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(graph_watch, "BEGINS", 4.0)
+    words = {"reference": "half_sine", "reference_closures": 1}
+    told = r"did not begin within 4 s.*waiting for motor/state"
+    with processes(NodeProcess("motor_controller", **words)), pytest.raises(HannesError, match=told):
+        follow_profile(2.0, lambda: True)
+
+
+def test_a_hand_that_dies_during_a_profile_is_said(peer: Peer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(graph_watch, "STANDS", 1.5)
+    words = {"reference": "half_sine", "reference_closures": 4}
+    with processes(NodeProcess("motor_controller", **words)):
+        for name in ("encoder_position", "motor_current"):
+            peer.matched(name)
+        told = r"stands after \d\.\d of 20\.0 s.*motor/state or motor/current is too old"
+        with hand(peer, 4.0), pytest.raises(HannesError, match=told):
+            follow_profile(20.0, lambda: True)
