@@ -203,9 +203,26 @@ def test_a_profile_without_a_hand_is_refused_before_anything_is_recorded(
     assert not bag.exists()
 
 
+def test_what_only_a_profile_uses_is_refused_without_one(tmp_path: Path) -> None:
+    told = hannes("record", str(tmp_path / "bag"), "--period", "3", "--closures", "2")
+    assert told.returncode == 2 and "--closures, --period: only --profile" in told.stderr, told.stderr
+    told = hannes("record", str(tmp_path / "bag"), "--profile", "half_sine", "--model", "no_such_hand")
+    assert told.returncode == 2 and "no_such_hand" in told.stderr, told.stderr
+
+
+def test_a_training_that_could_not_end_well_is_refused_before_it_begins(tmp_path: Path) -> None:
+    for out, method, why in (
+        (tmp_path / "x.onnx", "foo", "Method 'foo' is unknown; valid are best, thesis"),
+        (tmp_path / "x.txt", "forest", "must end in .onnx"),
+        (Path("/proc/x.onnx"), "forest", "Cannot write the classifier '/proc/x.onnx'"),
+    ):
+        told = hannes("stiffness", "train", "--out", str(out), "--method", method)
+        assert told.returncode == 2 and why in told.stderr and told.stderr.count("\n") == 1, told.stderr
+
+
 def test_the_demo_says_what_was_noticed_in_a_bag_in_a_line(tmp_path: Path) -> None:
     from bags.bag_samples import foreign_bag, motor_messages
-    from hannes_bringup.cli.demo import _read
+    from hannes_bags.reading import read_and_say
 
     stamps = np.arange(1, 301, dtype=np.int64) * 1_000_000
     stamps = np.concatenate([stamps[:5], stamps[4:]])
@@ -213,5 +230,5 @@ def test_the_demo_says_what_was_noticed_in_a_bag_in_a_line(tmp_path: Path) -> No
     said: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        _read(bag, said.append)
+        read_and_say(bag, said.append)
     assert len(said) == 1 and "Messages that repeat the one before, its stamp too, were left out" in said[0]

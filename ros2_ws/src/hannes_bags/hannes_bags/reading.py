@@ -9,7 +9,7 @@ suspicious is a sentence in `metadata["warnings"]`.
 from __future__ import annotations
 
 import warnings as python_warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,6 +69,16 @@ class BagInfo:
     def duration(self) -> float:
         """s"""
         return (self.end_ns - self.start_ns) * 1e-9
+
+
+def read_and_say(path: str | Path, say: Callable[[str], None]) -> Recording:
+    """The bag; what was noticed in it is said in plain sentences, not as Python's warnings."""
+    with python_warnings.catch_warnings():
+        python_warnings.simplefilter("ignore", RecordingWarning)
+        recording = read_bag(path)
+    for sentence in recording.warnings:
+        say(sentence)
+    return recording
 
 
 def bag_info(path: str | Path, *, limits: Limits | None = None) -> BagInfo:

@@ -15,7 +15,7 @@ import mmap
 import re
 import sqlite3
 import stat
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -99,6 +99,37 @@ def one_line(text: object) -> str:
 def is_name(text: str) -> bool:
     """Whether a text may be the name of a topic or of a message type in ROS 2."""
     return _NAME.fullmatch(text) is not None
+
+
+def existing(given: str | Path, what: str = "bag") -> Path:
+    """The path, if there is something at it."""
+    path = Path(given)
+    if not path.exists():
+        raise HannesError(f"No {what} '{given}': the path does not exist.")
+    return path
+
+
+def find_bags(paths: Sequence[str | Path]) -> list[Path]:
+    """Bags below the given paths: a bag (folder with metadata.yaml, .mcap, .db3) or a folder of bags."""
+    out: list[Path] = []
+    for given in paths:
+        path = existing(given)
+        if path.is_dir() and not (path / METADATA_FILE).exists() and not _stored(path):
+            below = sorted(
+                p for p in path.iterdir() if p.is_dir() and ((p / METADATA_FILE).exists() or _stored(p))
+            )
+            if not below:
+                raise HannesError(
+                    f"'{given}' holds no bag: a bag is a folder with metadata.yaml and .mcap or .db3 files."
+                )
+            out += below
+        else:
+            out.append(path)
+    return out
+
+
+def _stored(path: Path) -> list[Path]:
+    return [p for p in path.iterdir() if p.suffix in _STORAGE]
 
 
 def locate(path: str | Path) -> BagFiles:

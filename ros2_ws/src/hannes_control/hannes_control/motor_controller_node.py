@@ -27,6 +27,8 @@ from .reference import FULL_CLOSURE, PROFILES, Profile, check_travel, make_profi
 
 _CHECK_S = 0.02
 _SLOWEST_STATE_HZ = 80.0
+_PATIENCE_S = 2.0
+"""s for which an input may be waited for without a word in the log."""
 _ANOTHER_CLOCK_S = 0.5
 """Stamps that are so far off, or for so long without a good one between, are of another clock; others are late."""
 _ZERO = convert.float64_bytes(0.0)
@@ -127,6 +129,8 @@ class MotorController(HannesNode, LifecycleNode):
         self._state_at = self._current_at = self._reference_at = 0.0
         self._stale = False
         self._late_since: float | None = None
+        self._waits_since: float | None = None
+        self._reported = 0
         self._played = -1
         self._answered = self._heard = -1
         self._period_ns = round(p.period * 1e9)
@@ -495,7 +499,9 @@ class MotorController(HannesNode, LifecycleNode):
         if self._lockstep and (absent := self._peers.missing()):
             return WARN, f"waiting for {', '.join(absent)}", values
         if self._lockstep:
-            missing = [_TOPICS[slot] for slot in self._join.missing()]
+            # Within a tick something is missing always: what counts is whether none was answered since the last report.
+            answered, self._reported = self._health.cycles > self._reported, self._health.cycles
+            missing = [] if answered else [_TOPICS[slot] for slot in self._join.missing()]
             level = WARN if self._state_at and silence({"any message": self._state_at}) else OK
             return (
                 (level, f"waiting for {', '.join(missing)}", values) if missing else (OK, "running", values)
@@ -512,7 +518,12 @@ class MotorController(HannesNode, LifecycleNode):
             if value is None and name not in self._health.faults
         ]
         if absent:
-            return WARN, f"waiting for {', '.join(absent)}", values
+            waiting, now = f"waiting for {', '.join(absent)}", monotonic()
+            self._waits_since = self._waits_since or now
+            if now - self._waits_since > _PATIENCE_S:
+                self.get_logger().warning(waiting, throttle_duration_sec=30.0)
+            return WARN, waiting, values
+        self._waits_since = None
         if self._profile is None and (silent := silence({"reference_position": self._reference_at})):
             return WARN, f"{silent}: the last one is held", values
         return OK, "running", values

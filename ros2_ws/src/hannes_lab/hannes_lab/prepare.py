@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from hannes_bags.reading import read_bag
+from hannes_bags.storage import existing, find_bags
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_sim.effect import call_own
@@ -63,37 +64,6 @@ class Prepared:
     problem: Problem
     nuisances: tuple[Nuisance, ...]
     notes: tuple[str, ...]
-
-
-def existing(given: str | Path, what: str = "bag") -> Path:
-    """The path, if there is something at it."""
-    path = Path(given)
-    if not path.exists():
-        raise HannesError(f"No {what} '{given}': the path does not exist.")
-    return path
-
-
-def find_bags(paths: Sequence[str | Path]) -> list[Path]:
-    """Bags below the given paths: a bag (folder with metadata.yaml, .mcap, .db3) or a folder of bags."""
-    out: list[Path] = []
-    for given in paths:
-        path = existing(given)
-        if path.is_dir() and not (path / "metadata.yaml").exists() and not _storage(path):
-            below = sorted(
-                p for p in path.iterdir() if p.is_dir() and ((p / "metadata.yaml").exists() or _storage(p))
-            )
-            if not below:
-                raise HannesError(
-                    f"'{given}' holds no bag: a bag is a folder with metadata.yaml and .mcap or .db3 files."
-                )
-            out += below
-        else:
-            out.append(path)
-    return out
-
-
-def _storage(path: Path) -> list[Path]:
-    return [p for p in path.iterdir() if p.suffix in (".mcap", ".db3")]
 
 
 def load_trials(

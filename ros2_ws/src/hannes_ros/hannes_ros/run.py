@@ -228,6 +228,8 @@ def _help(program: str, classes: Sequence[Any]) -> None:
         f"FILE.yaml has a section '/{DEFAULT_NAMESPACE}/{node}:' (or '/**/{node}:' in any namespace, '/**:' for all "
         f"nodes)\nwith 'ros__parameters:' in it; a section of another name, such as '{node}:', is not read."
     )
+    if len(classes) > 1:
+        print(f"-p {node}:NAME:=VALUE gives a parameter to one of the nodes alone.")
     for cls in classes:
         title = (cls.__doc__ or "").strip().split("\n")[0]
         print(f"\n{cls.node_name}: {title}\n{help_text(cls.parameters)}")

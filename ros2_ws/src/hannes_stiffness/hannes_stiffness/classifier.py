@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -83,7 +84,7 @@ def save(
     sure       least probability of a sure answer
     estimator  the regression of the stiffness
     """
-    path = _onnx_path(path)
+    path = new_file(path)
     parts = {_PROBABILITIES: model}
     if estimator is not None:
         parts |= {_VALUE: estimator.value, _SPREAD: estimator.spread}
@@ -105,11 +106,10 @@ def save(
         "onnx": {"file": path.name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()},
     }
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
         path.with_suffix(".json").write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
-        raise HannesError(f"Cannot write the classifier '{path}': {error}.") from error
+        raise _not_written(path, error) from error
     return path
 
 
@@ -146,6 +146,23 @@ def _to_onnx(parts: Mapping[str, Any], width: int) -> Any:
     return onnx.helper.make_model(
         graph, opset_imports=list(merged.opset_import), ir_version=merged.ir_version, producer_name="hannes"
     )
+
+
+def new_file(path: str | Path) -> Path:
+    """Where a classifier may be written: HannesError where the name or the folder is none for it."""
+    path = _onnx_path(path)
+    trial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        trial.touch()
+        trial.unlink()
+    except OSError as error:
+        raise _not_written(path, error.strerror or error) from error
+    return path
+
+
+def _not_written(path: Path, why: object) -> HannesError:
+    return HannesError(f"Cannot write the classifier '{path}': {why}.")
 
 
 def _onnx_path(path: str | Path) -> Path:

@@ -128,8 +128,10 @@ def train(
     from .classifier import StiffnessClassifier
     from .dataset import Dataset, merge
     from .models import TreeSettings
+    from .training import check
     from .training import train as train_classifier
 
+    check(method, out)
     settings = TreeSettings(trees=trees, leaves=leaves, folds=folds)
     if data:
         training = merge([Dataset.load(folder) for folder in data])
@@ -150,17 +152,19 @@ def train(
 
 @app.command()
 def evaluate(
-    bags: Annotated[list[Path], typer.Argument(help="Bags of closures.")],
+    bags: Annotated[list[Path], typer.Argument(help="Bags of closures, or folders of bags.")],
     classifier: ClassifierOption = "",
     kind: Annotated[
         str | None,
-        typer.Option(help=f"What was grasped ({', '.join(STIFFNESS_CLASSES)}), where a bag does not say it."),
+        typer.Option(
+            help=f"What was grasped ({', '.join(STIFFNESS_CLASSES)}), instead of what the bags say."
+        ),
     ] = None,
     pictures: Annotated[Path | None, typer.Option(help="Folder for pictures of closures and scores.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Score the classifier on bags: windows as the thesis does, grasps, latency, reliability, stiffness."""
-    from hannes_bags.reading import read_bag
+    from hannes_bags.reading import read_and_say
 
     from .classifier import StiffnessClassifier
     from .evaluation import answer, scores_of
@@ -170,7 +174,7 @@ def evaluate(
     closures = []
     for bag in _bags(bags):
         _say(f"Reading {bag}.")
-        closures += measured_closures(read_bag(bag), kind)
+        closures += measured_closures(read_and_say(bag, _say), kind)
     answered = answer(loaded, closures)
     result = scores_of(answered)
     if pictures is not None:
@@ -191,12 +195,14 @@ def evaluate(
 
 
 def _bags(given: Sequence[Path]) -> list[Path]:
-    """The bags; a bag set stands for all of its parts."""
+    """The bags; a bag set stands for all of its parts, a folder of bags for the bags in it."""
+    from hannes_bags.storage import find_bags
+
     from .dataset import MANIFEST
 
     out: list[Path] = []
     for path in given:
-        out += sorted(path.glob("part_*[0-9]")) if (path / MANIFEST).is_file() else [path]
+        out += sorted(path.glob("part_*[0-9]")) if (path / MANIFEST).is_file() else find_bags([path])
     return out
 
 

@@ -14,7 +14,7 @@ from hannes_description.signals import STIFFNESS_CLASSES
 from hannes_sim.objects import OBJECTS, GraspObject
 from numpy.typing import NDArray
 
-from .classifier import StiffnessClassifier, save
+from .classifier import StiffnessClassifier, new_file, save
 from .dataset import Closure, Dataset, Scene, closure_of, closures_of, kind_of
 from .evaluation import answer, kind_name, scores_of, split_grasps
 from .features import SINGLE_SAMPLE, FeatureSpec
@@ -38,6 +38,13 @@ SURE = 0.7
 COMPARED = ("objects", "hands")
 """Groupings of the cross-validation that methods are compared by."""
 BEST = "best"
+
+
+def check(method: str, path: str | Path) -> None:
+    """HannesError where a training of this method into this file could not end well, before anything is simulated."""
+    if method not in (BEST, *METHODS):
+        raise HannesError(f"Method {method!r} is unknown; valid are {', '.join((BEST, *METHODS))}.")
+    new_file(path)
 
 
 def train(
@@ -65,6 +72,7 @@ def train(
     The thesis' method is trained as the thesis did: labels by the void current alone (P19), no calibration, no
     estimate. Returns the path of the ONNX file.
     """
+    check(method, path)
     settings = settings or TreeSettings()
     names = tuple(METHODS) if method == BEST else (method,)
     specs = {
@@ -185,8 +193,8 @@ def scene_of(recording: Recording, kind: str | None = None) -> Scene:
         else:
             raise HannesError(
                 f"The recording '{recording.source}' does not say what was grasped (metadata object is {said!r}; "
-                f"known are {', '.join((*OBJECTS, *STIFFNESS_CLASSES))}, or an object's data); say it with "
-                "--kind."
+                f"known are {', '.join(dict.fromkeys((*OBJECTS, *STIFFNESS_CLASSES)))}, or an object's "
+                "data); say it with --kind."
             )
     if kind not in STIFFNESS_CLASSES:
         raise HannesError(f"Kind {kind!r} is unknown; valid are {', '.join(STIFFNESS_CLASSES)}.")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from hannes_description.errors import HannesError
 
 from .output import JsonOption, print_json
 
@@ -27,13 +28,21 @@ def record(
         str,
         typer.Option(help="Drive the hand too: half_sine, ramp_hold or reversals, by a motor_controller."),
     ] = "",
-    closures: Annotated[int, typer.Option(min=1, help="With --profile: how often.")] = 13,
+    closures: Annotated[
+        int | None, typer.Option(min=1, help="With --profile: how often; without it 13 times.")
+    ] = None,
     period: Annotated[
         float, typer.Option(min=0.0, help="With --profile: s of one closure; 0: its own.")
     ] = 0.0,
     amplitude: Annotated[
         float, typer.Option(min=0.0, help="With --profile: rad at the motor pulley; 0: a full closure.")
     ] = 0.0,
+    model: Annotated[
+        str,
+        typer.Option(
+            help="With --profile: model (a name or a file) whose gains and travel the controller has."
+        ),
+    ] = "",
     more: MoreArgument = None,
 ) -> None:
     """Record the topics of the hand into a bag (MCAP, safe against a crash); Ctrl-C ends it.
@@ -50,8 +59,11 @@ def record(
     if topic:
         parameters["topics"] = topic
     if profile:
-        _record_profile(parameters, profile, closures, period, amplitude, more or [])
+        _record_profile(parameters, profile, closures or 13, period, amplitude, model, more or [])
     else:
+        given = {"--closures": closures, "--period": period, "--amplitude": amplitude, "--model": model}
+        if idle := ", ".join(name for name, value in given.items() if value):
+            raise HannesError(f"{idle}: only --profile, which drives the hand, makes use of that.")
         _become("recorder", parameters, more or [])
 
 
@@ -60,7 +72,13 @@ SEEK = 5.0
 
 
 def _record_profile(
-    recorder: dict[str, Any], profile: str, closures: int, period: float, amplitude: float, more: list[str]
+    recorder: dict[str, Any],
+    profile: str,
+    closures: int,
+    period: float,
+    amplitude: float,
+    model: str,
+    more: list[str],
 ) -> None:
     """Recorder and controller as child processes for as long as the profile lasts."""
     from hannes_control.reference import check_travel, make_profile
@@ -74,8 +92,9 @@ def _record_profile(
 
     given = {name: value for name, value in (("period", period), ("amplitude", amplitude)) if value > 0.0}
     seconds = make_profile(profile, closures=closures, **given).size * 1e-3
-    check_travel(amplitude, Model.load().parameters)
-    controller: dict[str, Any] = {"reference": profile, "reference_closures": closures}
+    name = str(Path(model).absolute()) if Path(model).is_file() else model or "nominal"
+    check_travel(amplitude, Model.load(name).parameters)
+    controller: dict[str, Any] = {"reference": profile, "reference_closures": closures, "model": name}
     controller |= {f"reference_{name}": value for name, value in given.items()}
     require_ros()
     apply_ros_environment()

@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 import time
-import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -123,7 +122,9 @@ def _run_graph(grasp: str, out: Path, emg: str, seconds: float, say: Callable[[s
             f"The node graph ended with code {done.returncode}; see {log}. Last line: "
             f"{last[-1] if last else '(none)'}"
         )
-    recording = _read(bag, say)
+    from hannes_bags.reading import read_and_say
+
+    recording = read_and_say(bag, lambda text: say(f"  {text}"))
     recording.require(["motor_current", "encoder_position", "reference_position", "stiffness_label"])
     current = recording["motor_current"].values
     labels = Counter(str(label) for label in recording["stiffness_label"].values)
@@ -133,18 +134,6 @@ def _run_graph(grasp: str, out: Path, emg: str, seconds: float, say: Callable[[s
         f"{current.max():.2f} A, grip force {force:.1f} N; classifier: "
         + ", ".join(f"{label} {100 * n / labels.total():.0f} %" for label, n in labels.most_common())
     )
-    return recording
-
-
-def _read(bag: Path, say: Callable[[str], None]) -> Recording:
-    """The bag; what was noticed in it is said in plain lines, not as Python's warnings."""
-    from hannes_bags.reading import RecordingWarning, read_bag
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RecordingWarning)
-        recording = read_bag(bag)
-    for sentence in recording.warnings:
-        say(f"  {sentence}")
     return recording
 
 
