@@ -191,6 +191,8 @@ class Model:
         changed = dict(parameters.entries)
         for name, entry in overrides.items():
             own = parameters[str(name)]  # unknown names are refused here, with the valid ones listed
+            if isinstance(entry, Mapping) and entry.get("unit") == own.unit:
+                entry = {"lower": own.lower, "upper": own.upper, **entry}
             given = changed[str(name)] = Parameter.from_dict(str(name), entry, where)
             if given.unit != own.unit:
                 raise HannesError(
