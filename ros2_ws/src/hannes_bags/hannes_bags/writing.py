@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 from hannes_description.errors import HannesError
+from hannes_description.files import write_whole
 from hannes_description.joints import ENCODER_JOINT, JOINT_NAMES
 from hannes_description.signals import NAMESPACE, SIGNALS
 
@@ -226,9 +227,7 @@ class BagWriter:
             self._stream.flush()
             os.fsync(self._stream.fileno())
             self._stream.close()
-            temporary = self.path / (METADATA_FILE + ".part")
-            temporary.write_text(text, encoding="utf-8")
-            temporary.replace(self.path / METADATA_FILE)
+            write_whole(self.path / METADATA_FILE, text)
         except OSError as error:
             raise HannesError(f"Cannot write the bag {self.path}: {error.strerror or error}.") from None
 

@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 from .errors import HannesError
+from .files import write_whole
 from .parameters import Parameter, ParameterSet, data_path, load_parameters, read_yaml
 
 SCHEMA = "hannes/model/1"
@@ -152,11 +153,7 @@ class Model:
         """Write the model as YAML; floats keep all their digits."""
         path = Path(path)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(
-                yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True, width=110),
-                encoding="utf-8",
-            )
+            write_whole(path, yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True, width=110))
         except OSError as error:
             raise HannesError(f"Cannot write the model file '{path}': {error}.") from error
         return path

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from hannes_description.errors import HannesError
+from hannes_description.files import write_whole
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -80,8 +81,7 @@ def write_report(
     )
     out = Path(path)
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(page, encoding="utf-8")
+        write_whole(out, page)
     except OSError as error:
         raise HannesError(f"The report cannot be written to '{out}': {error.strerror or error}.") from error
     return out

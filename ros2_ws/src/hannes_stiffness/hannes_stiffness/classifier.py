@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from hannes_description.errors import HannesError
+from hannes_description.files import write_whole
 from hannes_description.signals import STIFFNESS_CLASSES
 from numpy.typing import ArrayLike, NDArray
 
@@ -106,8 +107,8 @@ def save(
         "onnx": {"file": path.name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()},
     }
     try:
-        path.write_bytes(content)
-        path.with_suffix(".json").write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+        write_whole(path, content)
+        write_whole(path.with_suffix(".json"), json.dumps(manifest, indent=1) + "\n")
     except OSError as error:
         raise _not_written(path, error) from error
     return path

@@ -28,6 +28,7 @@ from hannes_bags.writing import write_recording
 from hannes_control.double_pid import DoublePID
 from hannes_control.reference import FULL_CLOSURE, PROFILES, make_profile
 from hannes_description.errors import HannesError
+from hannes_description.files import write_whole
 from hannes_description.model import EffectEntry, Model
 from hannes_description.parameters import data_path, read_yaml
 from hannes_description.signals import SIGNALS, STIFFNESS_CLASSES
@@ -634,10 +635,7 @@ def _open_set(path: Path, request: Mapping[str, Any]) -> None:
 
 def _write_manifest(path: Path, manifest: Mapping[str, Any]) -> None:
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        temporary = path / (MANIFEST + ".part")
-        temporary.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
-        temporary.replace(path / MANIFEST)
+        write_whole(path / MANIFEST, json.dumps(manifest, indent=1) + "\n")
     except OSError as error:
         raise HannesError(f"Cannot write the data set '{path}': {error}.") from error
 
