@@ -274,7 +274,8 @@ def test_in_lockstep_every_message_has_the_time_of_its_tick(
             child.send_signal(signal.SIGCONT)
         if tick % 25 == 24:
             # No more at once than a socket holds while its process is kept waiting; all four topics carry the number.
-            settle(lambda number=number: written(tmp_path / "bag").count(number[4:]) >= 4)
+            before = float64_bytes(tick - 1.0)[4:]
+            settle(lambda before=before: written(tmp_path / "bag").count(before) >= 4)
     output = end(child, signal.SIGINT)
     back = read_bag(tmp_path / "bag")
     assert back.start_ns == 0, output
