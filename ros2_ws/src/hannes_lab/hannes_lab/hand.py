@@ -6,11 +6,12 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from hannes_control.double_pid import DoublePID
+from hannes_control.double_pid import DoublePID, DoublePIDParameters
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.parameters import data_path, read_yaml
@@ -212,6 +213,12 @@ def _lowest_for(time: Array, reading: Array, span: float) -> float:
         return float(reading.min())
     pairs = np.column_stack([begins, ends[begins]]).ravel()
     return float(np.maximum.reduceat(reading, pairs)[::2].min())
+
+
+@lru_cache(maxsize=64)
+def _gains(settings: DoublePIDParameters, changed: tuple[tuple[str, float], ...]) -> Array:
+    """The controller's numbers with some of them changed."""
+    return replace(settings, **dict(changed)).to_array()
 
 
 class HandRig(PlantRig):
@@ -439,7 +446,7 @@ class HandRig(PlantRig):
         if trial.name in self._lowest and LOWEST in plant.names:
             of_plant[LOWEST] = self._lowest[trial.name]
         if isinstance(controller, DoublePID):
-            controller.parameters[:] = replace(controller.settings, **gains).to_array()
+            controller.parameters[:] = _gains(controller.settings, tuple(gains.items()))
         return self._run(model, of_plant, trial, moved(reference, delay, lead, trial), before)
 
     def observed(

@@ -199,6 +199,7 @@ class PlantRig:
         self._plants: dict[tuple[str, ...], tuple[Plant, Controller, dict[str, float]]] = {}
         self._signals: OrderedDict[tuple[Any, ...], dict[str, Array]] = OrderedDict()
         self._came_back = True
+        self._model: tuple[Model, tuple[str, ...], dict[str, float]] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A class from a user's file cannot be imported by name in another process.
@@ -316,7 +317,7 @@ class PlantRig:
 
         The last simulations are remembered: a parameter of one trial (`name@trial`) does not move the others.
         """
-        wanted = _wanted(model, values, trial)
+        wanted = self._wanted(model, values, trial)
         key = (*self._key(model, trial), tuple(sorted(wanted.items())), reference.tobytes())
         if key in self._signals:
             self._signals.move_to_end(key)
@@ -363,7 +364,7 @@ class PlantRig:
     ) -> Rollout:
         """The rollout from reset, or from where the reference `before` leads."""
         plant, controller, base = self._plant(model, trial)
-        wanted = _wanted(model, values, trial)
+        wanted = self._wanted(model, values, trial)
         reference = moved(reference, wanted.pop(REFERENCE_DELAY, 0.0), 0.0, trial)
         for name in set(base) - set(wanted):
             plant.set(name, base[name])
@@ -377,11 +378,28 @@ class PlantRig:
         self._came_back = came_back(done, trial, self.comes_back(model, trial))
         return done
 
+    def _of(self, model: Model) -> tuple[tuple[str, ...], dict[str, float]]:
+        """What tells its plant from another, and the values of its effects; kept while the model is the same."""
+        if self._model is None or self._model[0] is not model:
+            structure = (effect.source or effect.name for effect in model.effects)
+            variant = repr(sorted(model.variant.items()))
+            key = (model.plant, model.controller, model.parameters.sha256, variant, *structure)
+            values = {f"{e.name}.{n}": p.value for e in model.effects for n, p in e.parameters.items()}
+            self._model = (model, key, values)
+        return self._model[1:]
+
     def _key(self, model: Model, trial: Trial) -> tuple[str, ...]:
         """What tells one plant from another, but for the values of its parameters."""
-        structure = tuple(effect.source or effect.name for effect in model.effects)
-        variant = repr(sorted(model.variant.items()))
-        return (model.plant, model.controller, model.parameters.sha256, variant, trial.name, *structure)
+        return (trial.name, *self._of(model)[0])
+
+    def _wanted(self, model: Model, values: Mapping[str, float], trial: Trial) -> dict[str, float]:
+        """Parameters of the plant by name, for one trial."""
+        wanted = dict(self._of(model)[1])
+        for name, value in values.items():
+            parameter, _, where = name.partition("@") if "@" in name else (name, "", "")
+            if not where or where == trial.name:
+                wanted[parameter] = value
+        return wanted
 
     def _plant(self, model: Model, trial: Trial) -> tuple[Plant, Controller, dict[str, float]]:
         key = self._key(model, trial)
@@ -393,16 +411,6 @@ class PlantRig:
             _check_law(law, trial.period, f"The control law '{model.controller}'")
             self._plants[key] = (plant, law, {})
         return self._plants[key]
-
-
-def _wanted(model: Model, values: Mapping[str, float], trial: Trial) -> dict[str, float]:
-    """Parameters of the plant by name, for one trial."""
-    wanted = {f"{e.name}.{n}": p.value for e in model.effects for n, p in e.parameters.items()}
-    for name, value in values.items():
-        parameter, _, where = name.partition("@")
-        if not where or where == trial.name:
-            wanted[parameter] = value
-    return wanted
 
 
 def make_controller(model: Model, period: float) -> Controller:

@@ -118,10 +118,10 @@ def logger(current: Array, period: float, *, rectified: bool, window: float) -> 
     width = max(1, round(window / period))
     if width == 1:
         return values
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    last = np.arange(1, values.size + 1)
-    first = np.maximum(last - width, 0)
-    return (total[last] - total[first]) / (last - first)
+    total = np.cumsum(values)
+    sums = total.copy()
+    sums[width:] -= total[:-width]
+    return np.asarray(sums / np.minimum(np.arange(1, values.size + 1), width))
 
 
 FOLDED = 9.0

@@ -292,8 +292,11 @@ class ReducedPlant:
     def set(self, name: str, value: float) -> None:
         if name in _NAMES or name in _TRIAL_NAMES:
             self.parameters[_NAMES.get(name, _TRIAL_NAMES.get(name, 0))] = value
+            if name == "gear.ratio":
+                self._update_inertia()
         elif name == "motor.armature":
             self._armature = value
+            self._update_inertia()
         elif tuple(name.split(".", 1)) in self.effects.index:
             effect, parameter = name.split(".", 1)
             self.effects.set(effect, parameter, value)
@@ -301,7 +304,6 @@ class ReducedPlant:
             raise HannesError(
                 f"The reduced plant has no parameter '{name}'; valid are {', '.join(self.names)}."
             )
-        self._update_inertia()
 
     def get(self, name: str) -> float:
         """The present value of a parameter that `set` takes."""
