@@ -83,7 +83,7 @@ def test_a_packed_sqlite_file_is_refused_with_advice(tmp_path: Path) -> None:
 
 def test_times_that_a_recorder_had_to_guess_are_said(tmp_path: Path) -> None:
     path = foreign_bag(tmp_path / "bag", motor_messages(STAMPS), custom={"misplaced_messages": "12"})
-    with pytest.warns(RecordingWarning, match="12 messages count too early"):
+    with pytest.warns(RecordingWarning, match="12 messages have too early a log time"):
         read_bag(path)
 
 

@@ -232,7 +232,7 @@ def test_a_file_that_is_missing_in_the_middle_is_named_and_so_is_the_hole(tmp_pa
     saved = recover(path, tmp_path / "saved")
     assert saved.messages == 3000 and saved.damage == ("bag_2.mcap is missing.",)
     assert saved.gap == pytest.approx((1.0 - 0.001, 1.5), abs=1.1e-3)
-    assert saved.losses.endswith("without a message is from 0.999 to 1.500 s")
+    assert saved.losses.endswith("; none is there from 0.999 to 1.500 s")
 
 
 # ---- commands -----------------------------------------------------------------------------------------------------

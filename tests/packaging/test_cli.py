@@ -208,6 +208,17 @@ def test_what_only_a_profile_uses_is_refused_without_one(tmp_path: Path) -> None
     assert told.returncode == 2 and "--closures, --period: only --profile" in told.stderr, told.stderr
     told = hannes("record", str(tmp_path / "bag"), "--profile", "half_sine", "--model", "no_such_hand")
     assert told.returncode == 2 and "no_such_hand" in told.stderr, told.stderr
+    for content, why in (
+        ("controller: law.py:Law", "which motor_controller does not run"),
+        (
+            "overrides: {hand.travel: {value: 12.0, unit: rad, status: measured, source: x}}",
+            "a full closure|14.5",
+        ),
+    ):
+        (tmp_path / "own.yaml").write_text(f"schema: hannes/model/1\n{content}\n")
+        words = ("--profile", "half_sine", "--model", "own.yaml")
+        told = hannes("record", "bag", *words, cwd=tmp_path)
+        assert told.returncode == 2 and re.search(why, told.stderr), told.stderr
 
 
 def test_a_training_that_could_not_end_well_is_refused_before_it_begins(tmp_path: Path) -> None:

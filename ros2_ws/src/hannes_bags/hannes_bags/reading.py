@@ -28,7 +28,8 @@ from .storage import BagMessages, TopicEntry, locate
 
 IntArray = npt.NDArray[np.int64]
 
-RESERVED = ("warnings", "bag", "clock", "start_ns")
+MISPLACED = "misplaced_messages"
+RESERVED = ("warnings", "bag", "clock", MISPLACED, "start_ns")
 """Metadata entries that reading sets; they are not written back."""
 
 _JOINT_SIGNALS = ("joint_positions", "joint_velocities")
@@ -518,11 +519,11 @@ class _Reader:
         sha256: str,
     ) -> Recording:
         start = min(int(times[0]) for times, _ in samples.values())
-        misplaced = self.messages.metadata.get("misplaced_messages")
+        misplaced = self.messages.metadata.get(MISPLACED)
         if isinstance(misplaced, int) and misplaced:
             self.warnings.append(
-                f"{misplaced} messages count too early: the recorder had no simulated time for them in time; signals "
-                "without a header (all but encoder_position) may be shifted."
+                f"{misplaced} messages have too early a log time: /clock came too late; signals without "
+                "a header (those of Float64 topics) may be shifted."
             )
         stored = self.messages.metadata.get("start_ns")
         if isinstance(stored, int) and not isinstance(stored, bool) and 0 <= start - stored < 10**15:
@@ -535,11 +536,12 @@ class _Reader:
             self._look_at_units(channel)
         metadata = {key: value for key, value in self.messages.metadata.items() if key not in RESERVED}
         metadata["warnings"] = list(self.warnings)
+        read = {name: chosen[name] for name in channels}
         metadata["bag"] = {
             "storage": self.messages.bag.storage,
             "files": [file.name for file in self.messages.bag.files],
             "messages": sum(self.messages.counts.values()),
-            "topics": (read := {name: chosen[name] for name in channels}),
+            "topics": read,
             "unread": {n: t for n, t in self.messages.types.items() if n not in read.values()},
         }
         metadata["clock"] = {

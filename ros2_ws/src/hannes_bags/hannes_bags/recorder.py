@@ -12,6 +12,7 @@ begins with /clock and is complete before the next begins, every message so gets
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -41,14 +42,14 @@ class SimulatedTimes:
 
     clock_topic  topic of simulated time
     hold_ns      a message waits for the /clock after it at most this long (by `taken_ns`); it bounds what a
-                 kill can take
+                 kill can take, but for what comes before the first /clock, which waits for it
     misplaced    messages that were given out before a /clock came that had been sent before them: they count too early
     """
 
     clock_topic: str
-    hold_ns: int = 150_000_000
+    hold_ns: int = 120_000_000
     misplaced: int = 0
-    _guessed: list[int] = field(default_factory=list)
+    _guessed: deque[int] = field(default_factory=lambda: deque(maxlen=_CLOCKS_KEPT))
     _waiting: list[Received] = field(default_factory=list)
     _sent: list[int] = field(default_factory=list)
     _values: list[int] = field(default_factory=list)
@@ -67,15 +68,16 @@ class SimulatedTimes:
         place = bisect_right(self._sent, sent_ns)
         self._sent.insert(place, sent_ns)
         self._values.insert(place, value)
-        self.misplaced += sum(sent >= sent_ns for sent in self._guessed)
-        self._guessed.clear()
+        if place == len(self._sent) - 1:  # of one that overtook another, nothing is known yet
+            self.misplaced += sum(sent >= sent_ns for sent in self._guessed)
+            self._guessed.clear()
         if len(self._sent) > 2 * _CLOCKS_KEPT:
             del self._sent[:_CLOCKS_KEPT], self._values[:_CLOCKS_KEPT]
 
     @property
-    def known(self) -> bool:
-        """Whether a /clock has come."""
-        return bool(self._sent)
+    def latest(self) -> int | None:
+        """The latest simulated time, ns; None before the first /clock."""
+        return self._values[-1] if self._values else None
 
     @property
     def waiting(self) -> int:
@@ -181,6 +183,7 @@ class Recorder:
     def _write(self, now_ns: int, *, everything: bool, received: bool = False) -> None:
         if self.simulated is not None:
             for message, log_ns in self.simulated.release(now_ns, everything=everything):
-                self.writer.write(
-                    message.topic, message.data, message.received_ns if received else max(0, log_ns)
-                )
+                if received:
+                    self.writer.write(message.topic, message.data, message.received_ns, message.sent_ns)
+                else:
+                    self.writer.write(message.topic, message.data, max(0, log_ns))

@@ -33,6 +33,8 @@ _SYNC_S = 1.0
 _STOP_S = 0.5
 _LATE_S = 2.0
 _OWN_CLOCK_NS = 1_000_000_000
+_HELD_MS = 170.0
+"""From when a message is taken until it is handed over at the latest: less than the 0.2 s that a kill may take."""
 _DEPTH = 4000
 _MOST_AT_ONCE = 5000
 _LEADING = SIGNALS["encoder_position"].topic
@@ -133,7 +135,7 @@ class RecorderNode(HannesNode, Node):
         self._subscriptions_by_topic: dict[str, Subscription] = {}
         self._clock = self.resolve_topic_name(CLOCK_TOPIC)
         self._health = self.resolve_topic_name(DIAGNOSTICS_TOPIC)
-        self._times = SimulatedTimes(self._clock)
+        self._times = SimulatedTimes(self._clock, hold_ns=round((_HELD_MS - p.flush_ms) * 1e6))
         self._only_heard = self._clock not in self._wanted and p.clock != "computer"
         if self._only_heard:
             self._wanted[self._clock] = _TYPES[CLOCK_TOPIC]
@@ -164,7 +166,7 @@ class RecorderNode(HannesNode, Node):
             self._decide()
         if self._simulated:
             self._clocks.several()
-            if self._recorder is not None and not self._times.known and time.monotonic() > self._late_at:
+            if self._recorder is not None and self._times.latest is None and time.monotonic() > self._late_at:
                 self.get_logger().warning(
                     f"waiting for {self._clock}: until it comes, nothing is written (clock:=computer does without)",
                     throttle_duration_sec=10.0,
@@ -292,12 +294,25 @@ class RecorderNode(HannesNode, Node):
         )
         if not (chosen and self._simulated) or stamp is None or abs(sent_ns - stamp) > _OWN_CLOCK_NS:
             return
+        if (told := self._times.latest) is not None and abs(told - stamp) <= _OWN_CLOCK_NS:
+            return
         assert self._recorder is not None
         self._simulated = False
         self._recorder.use_receive_times(time.time_ns())
         self.get_logger().warning(
             f"{self._clock} is not the time of {self._leading}, which is stamped by the computer's clock: "
             "log times are those of reception"
+        )
+
+    def _unchecked(self) -> bool:
+        """Whether motor/state, which tells whose time /clock is, has not come yet though somebody publishes it."""
+        return (
+            self._simulated
+            and self._p.clock == "auto"
+            and self._leading in self._wanted
+            and self._leading not in self._begun
+            and self.count_publishers(self._leading) > 0
+            and time.monotonic() < self._late_at + _LATE_S
         )
 
     def _offered(self, topic: str) -> Qos:
@@ -311,6 +326,8 @@ class RecorderNode(HannesNode, Node):
             return
         now_ns = time.time_ns()
         self._poll()  # where this process was held up, /clock waits behind the messages of its time
+        if self._unchecked():
+            return
         try:
             self._recorder.hand_over(now_ns)
         except HannesError as error:
@@ -330,6 +347,8 @@ class RecorderNode(HannesNode, Node):
         until = time.monotonic() + _STOP_S
         while self.failure is None and self._poll() and time.monotonic() < until:
             time.sleep(0.02)
+        if self.failure is None and self._clock in self._subscriptions_by_topic:
+            self._take(self._clock, self._subscriptions_by_topic[self._clock])  # of what was taken last
         self._stop_sync.set()
         if self._sync.is_alive():
             self._sync.join(timeout=5.0)
@@ -350,8 +369,8 @@ class RecorderNode(HannesNode, Node):
             self.get_logger().warning(f"messages that never arrived: {dict(lost)}")
         if recorder.misplaced:
             self.get_logger().warning(
-                f"{recorder.misplaced} messages count too early: {self._clock} came more than "
-                f"{SimulatedTimes.hold_ns * 1e-6:.0f} ms after them. Do not use the log times of what has no header."
+                f"{recorder.misplaced} messages have too early a log time: {self._clock} came more than "
+                f"{self._times.hold_ns * 1e-6:.0f} ms after them. Do not use the log times of what has no header."
             )
         self.get_logger().info(f"{recorder.writer.message_count} messages in {self._p.output}")
 

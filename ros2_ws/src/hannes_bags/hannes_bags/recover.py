@@ -36,6 +36,8 @@ from .storage import (
 )
 from .writing import BagWriter, Qos
 
+_HOLE_S = 0.2
+"""s without a message that are worth a word where some are missing."""
 _NO_LIMIT = Limits(total_bytes=1 << 50, messages=1 << 50)
 
 
@@ -87,9 +89,9 @@ class Recovery:
             return "no message is missing"
         missing = self.recorded - self.messages
         begin, end = self.gap
+        hole = f"; none is there from {begin:.3f} to {end:.3f} s" if end - begin > _HOLE_S else ""
         return (
-            f"{missing} of {self.recorded} messages are missing, about {self.lost_s:.3f} s at the end; "
-            f"the longest time without a message is from {begin:.3f} to {end:.3f} s"
+            f"{missing} of {self.recorded} messages are missing, about {self.lost_s:.3f} s at the end{hole}"
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -153,7 +155,7 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
     _gather_metadata(files, salvage)
     writer: BagWriter | None = None
     counts: dict[str, int] = {}
-    first, last, gap = 2**63, 0, (0, 0)
+    first, last, gap = 2**63, -1, (0, 0)
     try:
         for topic, log_ns, data in _messages(files, salvage):
             if writer is None:
@@ -163,7 +165,7 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
                 _announce(writer, topic, salvage.definitions[topic])
             writer.write(topic, data, log_ns)
             counts[topic] += 1
-            if last and log_ns - last > gap[1] - gap[0]:
+            if last >= 0 and log_ns - last > gap[1] - gap[0]:
                 gap = (last, log_ns)
             first, last = min(first, log_ns), max(last, log_ns)
     except OSError as error:
@@ -194,7 +196,7 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
         unread_bytes=salvage.unread_bytes,
         recorded=recorded,
         lost_s=max(0, end - last) * 1e-9,
-        gap=((gap[0] - first) * 1e-9, (gap[1] - first) * 1e-9) if gap[0] else (0.0, 0.0),
+        gap=((gap[0] - first) * 1e-9, (gap[1] - first) * 1e-9) if gap[1] else (0.0, 0.0),
         damage=tuple(salvage.damage),
     )
 
@@ -203,7 +205,7 @@ def _missing(information: Mapping[str, Any], folder: Path) -> list[str]:
     """Files that metadata.yaml names and that are not there."""
     names = information.get("relative_file_paths")
     told = [Path(name).name for name in names if isinstance(name, str)] if isinstance(names, list) else []
-    return [name for name in told if not (folder / name).exists()]
+    return [n for n in told if not (folder / n).exists() and not (folder / n.removesuffix(".zstd")).exists()]
 
 
 def _told(information: Mapping[str, Any], kept: int) -> tuple[int | None, int | None]:

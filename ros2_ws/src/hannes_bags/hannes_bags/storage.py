@@ -187,12 +187,9 @@ def _locate_folder(path: Path) -> BagFiles:
         # Before version 4 the paths were relative to the folder that holds the bag's folder.
         relative = pure.name if isinstance(version, int) and version < 4 else name
         file = path / relative
-        if (
-            file.suffix == ".zstd"
-            and file.with_suffix("").suffix in _STORAGE
-            and file.with_suffix("").exists()
-        ):
-            file = file.with_suffix("")
+        plain = file.with_suffix("") if file.suffix == ".zstd" else file
+        if plain.suffix == ".db3" or not file.exists():  # a packed SQLite file cannot be read in place
+            file = plain if plain.exists() else file
         _inside(path, name, file)
         if file in files:
             raise HannesError(f"{metadata_path}: relative_file_paths names {name!r} twice.")

@@ -29,7 +29,7 @@ QUIET, LONGEST = 0.5, 3.0
 """s: discovery is over when no topic or node was added for QUIET, or after LONGEST."""
 HAND = f"/{DEFAULT_NAMESPACE}/{SIGNALS['encoder_position'].topic}"
 REFERENCE = f"/{DEFAULT_NAMESPACE}/{SIGNALS['reference_position'].topic}"
-BEGINS, STANDS, REST = 15.0, 5.0, 1.5
+BEGINS, STANDS, REST = 30.0, 5.0, 1.5
 """s: a profile begins within BEGINS, stands for no longer than STANDS, and is followed for REST more."""
 HIDDEN = ("/parameter_events", "/rosout")
 LEVELS = {b"\x00": "ok", b"\x01": "warn", b"\x02": "error", b"\x03": "stale"}
@@ -94,8 +94,9 @@ def watch(window: float, context: Context | None = None) -> GraphSeen:
         return _watch(node, executor, window)
 
 
-def require_hand(timeout: float) -> None:
-    """Raise a HannesError where no hand is found within `timeout` seconds: nobody who publishes motor/state."""
+def require_free_hand(timeout: float) -> None:
+    """Raise a HannesError where no hand is found within `timeout` seconds (nobody who publishes motor/state), or where
+    somebody moves it already."""
     with visit("peers", EventsExecutor) as (node, executor):
         end = time.monotonic() + timeout
         while not node.count_publishers(HAND):
@@ -105,13 +106,30 @@ def require_hand(timeout: float) -> None:
                     "board, running? (`hannes run hand_sim` starts one.)"
                 )
             _spin(executor, 0.05)
+        _spin(executor, QUIET)
+        if others := [i.node_name for i in node.get_publishers_info_by_topic(REFERENCE)]:
+            raise HannesError(
+                f"{REFERENCE} is published already, by {', '.join(others)}: a profile would mix with it. End that node."
+            )
+
+
+def wait_for_recorder(running: Callable[[], bool]) -> None:
+    """Return when the recorder hears the graph, after BEGINS, or when `running` is no longer true."""
+    with visit("recorder", EventsExecutor) as (node, executor):
+        end = time.monotonic() + BEGINS
+        while running() and time.monotonic() < end:
+            if any(name.startswith("_recorder") for name in node.get_node_names()):
+                _spin(executor, 0.2)  # from its start to its last subscription
+                return
+            _spin(executor, 0.05)
 
 
 def follow_profile(seconds: float, running: Callable[[], bool]) -> None:
     """Return when the controller has played its profile of so many seconds and the hand has come to rest, or when
     `running` is no longer true.
 
-    Looks at what has come, instead of at each message: the control loop beside it needs the machine.
+    Looks ten times a second whether references have come, instead of at each message: the control loop beside it needs
+    the machine. So the time that was played is an estimate, which REST covers.
     Raises HannesError where the profile does not begin, or stands: with what the controller says of itself.
     """
     with visit("profile", EventsExecutor) as (node, _):

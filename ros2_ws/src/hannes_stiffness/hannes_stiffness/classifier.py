@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 from hannes_description.errors import HannesError
-from hannes_description.files import write_whole
+from hannes_description.files import write_all
 from hannes_description.signals import STIFFNESS_CLASSES
 from numpy.typing import ArrayLike, NDArray
 
@@ -107,8 +107,7 @@ def save(
         "onnx": {"file": path.name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()},
     }
     try:
-        write_whole(path, content)
-        write_whole(path.with_suffix(".json"), json.dumps(manifest, indent=1) + "\n")
+        write_all({path: content, path.with_suffix(".json"): json.dumps(manifest, indent=1) + "\n"})
     except OSError as error:
         raise _not_written(path, error) from error
     return path
@@ -152,6 +151,8 @@ def _to_onnx(parts: Mapping[str, Any], width: int) -> Any:
 def new_file(path: str | Path) -> Path:
     """Where a classifier may be written: HannesError where the name or the folder is none for it."""
     path = _onnx_path(path)
+    if path.is_dir():
+        raise _not_written(path, "it is a folder")
     trial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

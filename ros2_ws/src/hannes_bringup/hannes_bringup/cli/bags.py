@@ -81,7 +81,7 @@ def _record_profile(
     more: list[str],
 ) -> None:
     """Recorder and controller as child processes for as long as the profile lasts."""
-    from hannes_control.reference import check_travel, make_profile
+    from hannes_control.reference import FULL_CLOSURE, check_travel, make_profile
     from hannes_description.model import Model
 
     from hannes_bringup.environment import apply_ros_environment, require_ros, ros_environment
@@ -92,24 +92,30 @@ def _record_profile(
 
     given = {name: value for name, value in (("period", period), ("amplitude", amplitude)) if value > 0.0}
     seconds = make_profile(profile, closures=closures, **given).size * 1e-3
-    name = str(Path(model).absolute()) if Path(model).is_file() else model or "nominal"
-    check_travel(amplitude, Model.load(name).parameters)
+    name = str(Path(model).absolute()) if Path(model).suffix in (".yaml", ".yml") else model or "nominal"
+    loaded = Model.load(name)
+    check_travel(amplitude or FULL_CLOSURE, loaded.parameters)
+    if loaded.controller != "double_pid":
+        raise HannesError(
+            f"Model '{loaded.name}' has the control law '{loaded.controller}', which motor_controller does not run: "
+            "move the hand by a controller of your own, and record without --profile."
+        )
     controller: dict[str, Any] = {"reference": profile, "reference_closures": closures, "model": name}
     controller |= {f"reference_{name}": value for name, value in given.items()}
     require_ros()
     apply_ros_environment()
-    from hannes_bringup.graph_watch import follow_profile, require_hand
+    from hannes_bringup.graph_watch import follow_profile, require_free_hand, wait_for_recorder
 
-    require_hand(SEEK)
+    require_free_hand(SEEK)
     environment = ros_environment()
     raise_on_signals()
     with ProcessGroup(lambda text: typer.echo(text, err=True), environment) as group:
         try:
-            for name, words in (
-                ("recorder", _words(recorder, more)),
-                ("motor_controller", _words(controller, [])),
-            ):
-                group.start(name, [*find_command(NODES[name], name, environment), *words])
+            recording = [*find_command(NODES["recorder"], "recorder", environment), *_words(recorder, more)]
+            group.start("recorder", recording)
+            wait_for_recorder(lambda: bool(group.running))
+            driving = find_command(NODES["motor_controller"], "motor_controller", environment)
+            group.start("motor_controller", [*driving, *_words(controller, [])])
             follow_profile(seconds, lambda: len(group.running) == 2)
             if len(group.running) < 2:
                 raise typer.Exit(1)
