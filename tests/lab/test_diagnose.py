@@ -265,6 +265,19 @@ def test_effects_that_bend_the_model_and_leave_most_of_the_error_are_no_answer(g
     ):
         assert bent_sentence(choice, falls) == ""
 
+    def alone(of: Search, sds: float, error: float) -> str:
+        """Of the model without effects, with a viscous friction so many tolerances off."""
+        z = one.fit.z.copy()
+        z[off] = sds
+        choice = Choice(of, Candidate((), replace(one.fit, z=z), one.penalised), limits, True, ())
+        return bent_sentence(choice, (*begin, fall(error)))
+
+    assert "only with friction.viscous" in alone(about, 4.0, 2.0)
+    assert not (alone(about, -4.0, 2.0) or alone(about, 4.0, 1.3) or alone(about, 2.0, 2.0)), (
+        "no effect takes friction away"
+    )
+    assert not alone(search, 4.0, 2.0), "the model has no error of its own there"
+
 
 def test_where_the_model_has_an_error_of_its_own_more_ties(gloved: Search) -> None:
     search = gloved

@@ -81,9 +81,12 @@ def add_effects(
     for k, name in enumerate(sources):
         progress(k, len(sources), f"fit with {name}")
         best = search.polish(search.add(best, name))
-    best = search.with_spread(best)
-    limits = chance(prepared.problem, search.null().fit, {})
-    falls = error_falls(prepared, search, best)
+    # As a diagnosis does: noise and scatter are estimated where the fit has come.
+    first, search = search, search.renewed(best)
+    (again,) = search.refitted([best])
+    best = search.with_spread(search.polish(again))
+    limits = chance(search.problem, best.fit, search.signatures(best))
+    falls = error_falls(replace(prepared, problem=search.problem), search, best, first=first)
     return Addition(
         with_provenance(fitted_model(prepared.model, search, best, limits), prepared, falls),
         found_effects(search, best, limits, falls),

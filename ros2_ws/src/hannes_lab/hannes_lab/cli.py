@@ -20,6 +20,7 @@ from hannes_description.signals import SIGNALS
 from hannes_sim.effect import effect_source, load_effect, strength_of
 from joblib import cpu_count
 from rich.console import Console
+from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -267,8 +268,20 @@ def _with_unit(value: float, unit: str, digits: int = 4) -> str:
     return _number(value, digits) if unit in ("", "1") else f"{_number(value, digits)} {unit}"
 
 
+PIPED = 110
+"""Columns of what is no terminal, and of a table whose numbers a narrower one would cut."""
+
+
 def _console() -> Console:
-    return Console(width=None if sys.stdout.isatty() else 110, highlight=False)
+    return Console(width=None if sys.stdout.isatty() else PIPED, highlight=False)
+
+
+def _print_table(console: Console, table: Table) -> None:
+    """The table, wider than a narrow terminal where its numbers would be cut."""
+    whole = Measurement.get(console, console.options.update(max_width=1000), table).maximum
+    if console.width < min(whole, PIPED):
+        console = Console(width=min(whole, PIPED), highlight=False)
+    console.print(table)
 
 
 def _command() -> str:
@@ -328,7 +341,7 @@ def _show_comparison(result: Comparison) -> None:
         )
     if any(c.fails for c in result.cells):
         table.caption = "fails: the mean over the closures is further off than their scatter makes it"
-    console.print(table)
+    _print_table(console, table)
     table = (
         Table(title="Figures of the thesis") if result.metrics else Table(show_header=False, show_edge=False)
     )
@@ -345,7 +358,7 @@ def _show_comparison(result: Comparison) -> None:
             _number(m.model),
             _relative_error(m),
         )
-    console.print(table)
+    _print_table(console, table)
     if result.metrics:
         console.print("Relative error: (measured - model) / measured.", style="dim")
     console.print(
@@ -498,7 +511,7 @@ def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> 
             conditions,
             *(_number(fall.held_out_signals.get(s, math.nan), 3) for s in signals),
         )
-    console.print(table)
+    _print_table(console, table)
     if signals:
         console.print("The last columns: error of each signal on held-out conditions.", style="dim")
 
@@ -519,7 +532,7 @@ def _show_falls_in_units(console: Console, found: Diagnosis | Addition, units: d
         table.add_row(
             ("+ " if k > 1 else "") + fall.added, *(_number(errors.get(s, math.nan), 3) for s in steps[-1])
         )
-    console.print(table)
+    _print_table(console, table)
 
 
 @interruptible

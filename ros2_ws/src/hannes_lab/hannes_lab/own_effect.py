@@ -7,6 +7,7 @@ imported, compiled and simulated once with its typical values where a time limit
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections.abc import Callable, Iterable, Sequence
 from multiprocessing.connection import Connection
 
@@ -82,6 +83,9 @@ def apart(work: Callable[[], str], *, ended: str, endless: str, limit: float) ->
 
 
 def _answer(work: Callable[[], str], there: Connection) -> None:
+    # What ends the parent ends this by its hand; the parent says so.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         said = work()
     except HannesError as error:

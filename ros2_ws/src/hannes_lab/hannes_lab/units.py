@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Guess = tuple[float, str, float]
 
 REFERENCE, ENCODER, CURRENT = "reference_position", "encoder_position", "motor_current"
+FORCE = "grip_force"
 
 DRIVES = (CURRENT, "motor_voltage", "motor_effort")
 """What a motor takes: it changes where the reference moves, whatever the hand does.  A grip force need not."""
@@ -125,6 +126,7 @@ def in_si(recordings: Sequence[Recording], scale: Mapping[str, float]) -> list[R
     for one in ones:
         _drop_absurd(one)
         _drop_dead(one, scale)
+    _drop_dead_force(ones, scale)
     for name in dict.fromkeys(name for one in ones for name in one.samples):
         with_it = [one for one in ones if name in one.samples]
         if name in scale:
@@ -132,6 +134,8 @@ def in_si(recordings: Sequence[Recording], scale: Mapping[str, float]) -> list[R
                 one.multiply(name, scale[name], "as --scale says")
         elif name in _GUESSES:
             _convert(with_it, name, *_by_size(with_it, name))
+    for one in ones:
+        _check_closes_upwards(one)
     with_encoder = [one for one in ones if ENCODER in one.samples]
     if ENCODER not in scale:
         _convert(with_encoder, ENCODER, *_by_reference(with_encoder))
@@ -189,6 +193,32 @@ def _drop_dead(one: _One, scale: Mapping[str, float]) -> None:
         del one.samples[name]
         one.notes.append(
             f"{told}: it was not measured and is left out; say --scale {name}=1 to take it as it is"
+        )
+
+
+def _drop_dead_force(ones: Sequence[_One], scale: Mapping[str, float]) -> None:
+    """Leave out a force that never changes in any of the recordings; in one of them nothing may have been pressed."""
+    with_it = [one for one in ones if FORCE in one.samples and set(one.samples) != {REFERENCE, FORCE}]
+    if FORCE in scale or any(np.ptp(one.samples[FORCE][1]) > 0.0 for one in with_it):
+        return
+    for one in with_it:
+        value = float(one.samples[FORCE][1][0])
+        one.notes.append(
+            f"{FORCE} is {value:.4g} {SIGNALS[FORCE].unit} throughout in all recordings: it was not measured, or "
+            f"nothing was pressed, and is left out; say --scale {FORCE}=1 to take it as it is"
+        )
+        del one.samples[FORCE]
+
+
+def _check_closes_upwards(one: _One) -> None:
+    """Raise a HannesError for a reference that sets off downwards, and goes over negative angles all but alone."""
+    values = one.samples[REFERENCE][1]
+    low, high = float(values.min()), float(values.max())
+    if values[0] > 0.5 * (low + high) and high < 0.1 * one.asked and low < -0.5 * one.asked:
+        raise HannesError(
+            f"{one.where}: {REFERENCE} goes from {values[0]:.4g} to {low:.4g} rad, but closing is positive: say "
+            f"--scale {REFERENCE}=-1 --scale {ENCODER}=-1 (and --scale {CURRENT}=-1, --scale motor_voltage=-1 where "
+            "they are negative while the hand closes)."
         )
 
 

@@ -14,7 +14,7 @@ from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
 from .falls import fall_sentence
 from .fit import Fit, fit
-from .problem import Problem, nuisance_coordinate
+from .problem import Coordinate, Problem, nuisance_coordinate
 from .rig import Nuisance
 from .search import FAR, PENALTY, Candidate, Search, key_of
 
@@ -28,6 +28,12 @@ CLOCK_PART = 0.25
 
 CLOCK_STEPS = 6
 """Length of the fit that tells it."""
+
+LEFT = 1.5
+"""Error on held-out closures, over the repeatability, from which a machine that is far outside its tolerances is no
+explanation: clean machines of others have not been seen to be."""
+
+_NOT_OF_MACHINE = ("control", "log", "encoder", "object")
 
 UNUSUAL = 1.5
 """Standard deviations of a wide prior from which a parameter that stands for an effect is worth a note."""
@@ -79,6 +85,9 @@ def summary(
             others = "; ".join(" + ".join(names_) for names_ in tied[1:])
             tie = f" With these data it ties with: {others}."
         return f"Missing: {names}. {fall}{tie}{far}"
+    if not names and bent:
+        either = "Something is missing, or the nominal model is not that of this machine"
+        return f"{either}: {bent}. {fall}{nearest_sentence(choice)}"
     part = f" Nearest comes {names}, which is not enough." if names else ""
     why = bent or f"the best model's {shortfall(search, best, limits)}"
     beyond = (
@@ -96,11 +105,19 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
     """Why what leaves no more than chance and the model's own error is no answer; empty if it is one.
 
     Where a set of effects takes a machine far outside its tolerances as well, and the error on what took no part in the
-    fit does not fall to half of what it is above the repeatability, the effects only help to bend the model.
+    fit does not fall to half of what it is above the repeatability, the effects only help to bend the model.  Where the
+    model alone does so, and leaves more than LEFT, something of the same form may be missing: nobody can tell.
     """
     best, before, after = choice.best, falls[1], falls[-1]
-    if not (best.names and best.far_off and choice.search.problem.discrepancy):
+    if not (best.far_off and choice.search.problem.discrepancy):
         return ""
+    if not best.names:
+        far = _far_above(best)
+        return (
+            f"it would explain all only with {far}, far outside the tolerance"
+            if far and after.held_out > LEFT
+            else ""
+        )
     pairs = ((before.held_out, after.held_out), (before.held_out_conditions, after.held_out_conditions))
     known = [(a, b) for a, b in pairs if np.isfinite([a, b]).all()]
     if not known or any(halved(a, b) for a, b in known):
@@ -182,11 +199,23 @@ def _moved_far(best: Candidate) -> str:
 
 def _far_values(best: Candidate) -> str:
     """The nominal parameters that are far from their values, with what they would be."""
-    return ", ".join(
-        f"{c.name} {best.fit.values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g}"
-        for c, off in best.fit.off
-        if off > FAR
+    return _said_far(best, [c for c, off in best.fit.off if off > FAR])
+
+
+def _far_above(best: Candidate) -> str:
+    """The same of what a machine keeps (not its controller's and loggers', nor a recording's own) and has too much of.
+
+    An effect adds to the nominal value.
+    """
+    far = [c for c, off in best.fit.off if off > FAR and best.fit.values[c.name] > c.value(0.0)]
+    return _said_far(
+        best, [c for c in far if "@" not in c.name and c.name.split(".")[0] not in _NOT_OF_MACHINE]
     )
+
+
+def _said_far(best: Candidate, far: Sequence[Coordinate]) -> str:
+    values = best.fit.values
+    return ", ".join(f"{c.name} {values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g}" for c in far)
 
 
 def failure_notes(problem: Problem) -> list[str]:
