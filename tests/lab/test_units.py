@@ -121,6 +121,43 @@ def test_a_current_in_neither_A_nor_mA_is_said(factor: float, said: str) -> None
     assert values(taken, "motor_current") == pytest.approx(values(closing(), "motor_current"))
 
 
+def test_a_hand_that_closes_to_negative_angles_is_refused_with_the_scale_to_say() -> None:
+    down = changed(closing(), reference_position=-1.0, encoder_position=-1.0)
+    with pytest.raises(
+        HannesError, match=r"goes from -?0 to -13 rad, but closing is positive: say --scale ref"
+    ):
+        make_trial(down)
+    turned = make_trial(down, scale={"reference_position": -1.0, "encoder_position": -1.0})
+    assert values(turned, "motor_current") == pytest.approx(values(closing(), "motor_current"))
+    assert values(turned, "encoder_position").max() > 10.0
+
+
+def test_a_force_that_never_changes_in_any_recording_is_left_out() -> None:
+    def pressed(force: np.ndarray) -> Recording:
+        free = closing()
+        channel = Channel(free["motor_current"].time, force, "N", "grip_force")
+        return Recording({**free.channels, "grip_force": channel}, {}, "pressed")
+
+    none = np.zeros(closing()["motor_current"].time.size)
+    dead = make_trial(pressed(none))
+    assert "grip_force" not in dead.signals and "grip_force is 0 N throughout" in dead.notes[-1]
+    some = np.linspace(0.0, 1.0, none.size)
+    first, second = in_si([pressed(none), pressed(some)], {})
+    assert "grip_force" in first and "grip_force" in second, "on nothing nothing presses"
+
+
+def test_a_current_that_goes_below_nought_is_not_rectified_whatever_the_recording_says() -> None:
+    said = {"current_rectified": True, "current_window": 0.01, "current_noise": 0.003}
+    signed = closing().with_metadata(sensors=said)
+    trial = make_trial(signed)
+    assert trial.options["sensors"] == {**said, "current_rectified": False}
+    assert any("taken as signed" in note for note in trial.notes)
+    channel = signed["motor_current"]
+    folded = Channel(channel.time, np.abs(channel.values) - 0.004, "A", "motor_current")
+    kept = make_trial(Recording({**signed.channels, "motor_current": folded}, {"sensors": said}, "folded"))
+    assert kept.options["sensors"] == said
+
+
 def test_a_current_that_never_changes_was_not_measured() -> None:
     dead = changed(closing(), motor_current=0.0)
     trial = make_trial(dead)

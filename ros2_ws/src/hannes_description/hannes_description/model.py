@@ -187,15 +187,18 @@ class Model:
             raise HannesError(f"{where}: 'overrides' must map parameter names to entries.")
         changed = dict(parameters.entries)
         for name, entry in overrides.items():
-            own = parameters[str(name)]  # unknown names are refused here, with the valid ones listed
-            if isinstance(entry, Mapping) and entry.get("unit") == own.unit:
+            if str(name) not in parameters:
+                near = parameters.near(str(name))
+                raise HannesError(f"{where}: unknown parameter '{name}'; valid are {', '.join(near)}.")
+            own = parameters[str(name)]
+            if isinstance(entry, Mapping) and "unit" in entry:
+                if entry["unit"] != own.unit:
+                    raise HannesError(
+                        f"{where}: parameter '{name}' is in '{entry['unit']}'; it must be in '{own.unit}', as in "
+                        f"{base}: convert value, lower and upper."
+                    )
                 entry = {"lower": own.lower, "upper": own.upper, **entry}
-            given = changed[str(name)] = Parameter.from_dict(str(name), entry, where)
-            if given.unit != own.unit:
-                raise HannesError(
-                    f"{where}: parameter '{name}' is in '{given.unit}'; it must be in '{own.unit}', as in {base}: "
-                    "convert value, lower and upper."
-                )
+            changed[str(name)] = Parameter.from_dict(str(name), entry, where)
         variant = content.get("variant") or {}
         provenance = content.get("provenance") or {}
         if not isinstance(variant, Mapping) or not isinstance(provenance, Mapping):

@@ -125,13 +125,15 @@ class ParameterSet(Mapping[str, Parameter]):
         try:
             return self.entries[name]
         except KeyError:
-            group = name.split(".")[0]
-            near = [n for n in self.entries if n.split(".")[0] == group] or sorted(
-                {n.split(".")[0] + ".*" for n in self.entries}
-            )
             raise HannesError(
-                f"Unknown parameter '{name}' in {self.source}; valid are {', '.join(near)}."
+                f"Unknown parameter '{name}' in {self.source}; valid are {', '.join(self.near(name))}."
             ) from None
+
+    def near(self, name: str) -> list[str]:
+        """The names of the group of a name, or where there is no such group the groups."""
+        group = name.split(".")[0]
+        own = [n for n in self.entries if n.split(".")[0] == group]
+        return own or sorted({n.split(".")[0] + ".*" for n in self.entries})
 
     def __contains__(self, name: object) -> bool:
         return name in self.entries

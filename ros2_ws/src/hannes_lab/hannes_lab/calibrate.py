@@ -180,8 +180,15 @@ def _notes_of_errors(errors: Mapping[str, float], best: Fit, held: Sequence[str]
 
     held  held parameters that would explain much of the misfit
     """
-    after, train, held_out = (errors.get(k, math.nan) for k in ("after", "train", "held_out"))
+    before, after, train, held_out = (
+        errors.get(k, math.nan) for k in ("before", "after", "train", "held_out")
+    )
     out = []
+    if after > before:
+        out.append(
+            f"The calibrated model is further off ({after:.2f} times the repeatability) than the given one "
+            f"({before:.2f}): do not use it. Something else must be free, or is missing (`hannes diagnose`)."
+        )
     if not math.isfinite(after):
         out.append(
             "No condition was repeated: there is no repeatability and no held-out closure to judge the model by."

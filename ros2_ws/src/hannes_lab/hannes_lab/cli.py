@@ -392,7 +392,9 @@ def diagnose(
     effects: Effects = None,
     only: Annotated[list[str] | None, typer.Option("--only", help="Consider only these effects.")] = None,
     add: Annotated[bool, typer.Option("--add", help="Write the model with what was found to --out.")] = False,
-    out: Annotated[Path, typer.Option("--out", help="Model file that --add writes.")] = Path("my_hand.yaml"),
+    model_file: Annotated[
+        Path | None, typer.Option("--out", help="Model file that --add writes; without it my_hand.yaml.")
+    ] = None,
     objects: Objects = None,
     scale: Scale = None,
     topics: Topics = None,
@@ -407,6 +409,9 @@ def diagnose(
     json: Json = False,
 ) -> None:
     """Which physical effect does the model lack: nothing, effects of the catalogue, or something unknown?"""
+    if model_file is not None and not add:
+        raise HannesError(f"--out {model_file}: only --add writes a model file; say --add too.")
+    out = model_file or Path("my_hand.yaml")
     _check_files(report, out if add else None)
     prepared = _prepared(bags, model, objects, signals, rig, scale, jobs, topics)
     _check_effects(prepared, [*(only or ()), *(effects or ())])
@@ -729,6 +734,12 @@ def _write_report(
 def _check_files(report: Path | None, model_file: Path | None = None) -> None:
     """Refuse files that cannot be written, before the work begins."""
     if report is not None:
+        from .pictures import ENDINGS
+
+        if report.suffix.lower() not in ("", ".html", ".htm", *ENDINGS):
+            raise HannesError(
+                f"The report {report} must end in .html, or for a picture in {', '.join(ENDINGS)}."
+            )
         check_writable(report, "The report")
     if model_file is not None:
         check_model_file(model_file)

@@ -42,6 +42,9 @@ STRANGE_HOLD_RATE = 225.0
 that are filled by a smooth curve.  The second is for recordings that do not say how they were logged."""
 
 
+_NEGATIVE = 0.005
+"""Part of the samples below nought, beyond noise, that a rectified current does not have."""
+
 RESTS = 0.02
 HELD = 0.05
 """A reference rests within this part of its span from its rest value, which it has for so large a part of the time."""
@@ -574,6 +577,9 @@ def trial_of(recording: Recording, *, name: str | None = None, period: float = 1
             "broken off is one of its own; --object NAME=soft says what was grasped in one of them"
         )
     options = {key: meta[key] for key in ("object", "sensors", "plant", "pose") if key in meta}
+    if "sensors" in options and "motor_current" in samples:
+        options["sensors"], said = _as_it_is(options["sensors"], samples["motor_current"][1])
+        notes += said
     return Trial(
         name,
         period,
@@ -585,6 +591,20 @@ def trial_of(recording: Recording, *, name: str | None = None, period: float = 1
         recording.sha256,
         tuple(notes),
     )
+
+
+def _as_it_is(sensors: Any, current: Array) -> tuple[Any, list[str]]:
+    """What a recording says of its loggers, less that a current is rectified which goes below nought."""
+    if not (isinstance(sensors, Mapping) and sensors.get("current_rectified")):
+        return sensors, []
+    noise = sensors.get("current_noise", 0.0)
+    least = 0.02 * float(np.ptp(current)) + 5.0 * (noise if isinstance(noise, int | float) else 0.0)
+    if np.mean(current < -least) < _NEGATIVE:
+        return sensors, []
+    return {**sensors, "current_rectified": False}, [
+        f"motor_current goes to {current.min():.3g} A, though the recording's `sensors` say that it is rectified: "
+        'taken as signed; write "current_rectified": false'
+    ]
 
 
 def _check_overlap(recording: Recording) -> None:
