@@ -292,6 +292,16 @@ def page_of(**parts: Any) -> Page:
     return page
 
 
+def test_the_headline_does_not_say_what_nobody_can_tell() -> None:
+    either = "Something is missing, or the nominal model is not that of this machine"
+    told = {
+        **make_diagnosis("unknown"),
+        "summary": f"{either}: it would explain all only with hand.stiffness.",
+    }
+    page = page_of(comparison=make_comparison(), after=None, diagnosis=told)
+    assert f"{either}." in page.words and "the catalogue does not hold" not in page.words
+
+
 @pytest.mark.parametrize(
     ("verdict", "headline"),
     [

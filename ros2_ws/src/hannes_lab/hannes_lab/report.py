@@ -225,7 +225,8 @@ def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | No
     elif kind == "effects":
         headline = lacking(diagnosis, names)
     elif kind == "unknown":
-        headline = "Something is missing that the catalogue does not hold."
+        either = str((diagnosis or {}).get("summary", "")).startswith(text.EITHER)
+        headline = f"{text.EITHER}." if either else "Something is missing that the catalogue does not hold."
     elif kind == "added":
         headline = f"The model has {text.listed(names)} now."
     elif kind != "comparison":

@@ -10,6 +10,9 @@ from typing import Any
 DASH = "–"
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
+EITHER = "Something is missing, or the nominal model is not that of this machine"
+"""How a summary begins where nobody can tell which."""
+
 
 def known(value: Any) -> float | None:
     """The value as a float; None for what is no finite number (None, NaN, infinity, a text)."""

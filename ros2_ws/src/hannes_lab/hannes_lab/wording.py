@@ -15,6 +15,7 @@ from .experiments import VISIBLE, Experiment
 from .falls import fall_sentence
 from .fit import Fit, fit
 from .problem import Coordinate, Problem, nuisance_coordinate
+from .report_text import EITHER
 from .rig import Nuisance
 from .search import FAR, PENALTY, Candidate, Search, key_of
 
@@ -86,8 +87,7 @@ def summary(
             tie = f" With these data it ties with: {others}."
         return f"Missing: {names}. {fall}{tie}{far}"
     if not names and bent:
-        either = "Something is missing, or the nominal model is not that of this machine"
-        return f"{either}: {bent}. {fall}{nearest_sentence(choice)}"
+        return f"{EITHER}: {bent}. {fall}{nearest_sentence(choice)}"
     part = f" Nearest comes {names}, which is not enough." if names else ""
     why = bent or f"the best model's {shortfall(search, best, limits)}"
     beyond = (
