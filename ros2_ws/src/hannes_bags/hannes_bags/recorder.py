@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .cdr import stamp_at
+from .reading import MISPLACED
 from .writing import BagWriter
 
 _CLOCKS_KEPT = 100_000
@@ -177,7 +178,7 @@ class Recorder:
         """Write what is left and close the bag; losses and wrong times are kept in its metadata."""
         self._write(now_ns, everything=True)
         lost = {topic: count for topic, count in sorted(self.losses.lost.items()) if count}
-        entries = {"lost_messages": lost, "misplaced_messages": self.misplaced}
+        entries = {"lost_messages": lost, MISPLACED: self.misplaced}
         self.writer.close({name: entry for name, entry in entries.items() if entry})
 
     def _write(self, now_ns: int, *, everything: bool, received: bool = False) -> None:

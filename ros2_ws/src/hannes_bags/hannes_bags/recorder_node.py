@@ -18,6 +18,7 @@ from hannes_ros.node import DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
 from hannes_ros.sources import Sources
+from hannes_ros.taking import taken
 from hannes_ros.topics import CLOCK_TOPIC, DIAGNOSTICS_TOPIC
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -144,6 +145,7 @@ class RecorderNode(HannesNode, Node):
         self._clocks = Sources(self, CLOCK_TOPIC, rule="time is told by one hand in lock-step, or one player")
         if p.clock == "auto" and self.get_parameter("use_sim_time").value:
             self._decided = True
+        self._may_be_others = not self._decided  # nobody said whose /clock it is
         self._seen_at: float | None = None
         self._settled_at: float | None = None
         self._leading_at = 0.0
@@ -256,23 +258,21 @@ class RecorderNode(HannesNode, Node):
         return taken
 
     def _take(self, topic: str, subscription: Subscription) -> int:
-        handle, kind = subscription.handle, subscription.msg_type
-        for count in range(_MOST_AT_ONCE):
-            with handle:
-                message = handle.take_message(kind, True)
-            if message is None:
-                return count
-            data, info = message
+        count = 0
+        for data, info in taken(subscription, _MOST_AT_ONCE):
+            count += 1
+            now_ns = time.time_ns()
+            sent_ns = info.get("source_timestamp") or now_ns
             if topic == self._clock and self._only_heard:
-                self._times.heard(data, info.get("source_timestamp") or time.time_ns())
+                self._times.heard(data, sent_ns)
                 continue
             if topic not in self._begun:
                 self._begin(topic)
                 if topic == self._leading:
-                    self._check_stamp(data, info.get("source_timestamp") or time.time_ns())
+                    self._check_stamp(data, sent_ns)
             assert self._recorder is not None
-            self._recorder.take(topic, data, info, time.time_ns())
-        return _MOST_AT_ONCE
+            self._recorder.take(topic, data, info, now_ns)
+        return count
 
     def _begin(self, topic: str) -> None:
         """The first message of a topic; of the first topic, the bag."""
@@ -288,11 +288,12 @@ class RecorderNode(HannesNode, Node):
 
     def _check_stamp(self, data: bytes, sent_ns: int) -> None:
         """Who stamps by the computer's clock does not live by the /clock that another hand publishes."""
-        stamp, chosen = (
-            stamp_at(data),
-            self._p.clock == "auto" and not self.get_parameter("use_sim_time").value,
-        )
-        if not (chosen and self._simulated) or stamp is None or abs(sent_ns - stamp) > _OWN_CLOCK_NS:
+        stamp = stamp_at(data)
+        if (
+            not (self._may_be_others and self._simulated)
+            or stamp is None
+            or abs(sent_ns - stamp) > _OWN_CLOCK_NS
+        ):
             return
         if (told := self._times.latest) is not None and abs(told - stamp) <= _OWN_CLOCK_NS:
             return
@@ -308,7 +309,7 @@ class RecorderNode(HannesNode, Node):
         """Whether motor/state, which tells whose time /clock is, has not come yet though somebody publishes it."""
         return (
             self._simulated
-            and self._p.clock == "auto"
+            and self._may_be_others
             and self._leading in self._wanted
             and self._leading not in self._begun
             and self.count_publishers(self._leading) > 0

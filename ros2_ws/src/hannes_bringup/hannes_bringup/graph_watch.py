@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from hannes_description.errors import HannesError
 from hannes_description.signals import SIGNALS
 from hannes_ros.node import DEFAULT_NAMESPACE
+from hannes_ros.taking import taken
 from hannes_ros.topics import DIAGNOSTICS_TOPIC
 from rclpy.context import Context
 from rclpy.executors import Executor
@@ -20,7 +21,6 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from rclpy.subscription import Subscription
 from std_msgs.msg import Float64
 
 from .visitor import visit
@@ -142,10 +142,10 @@ def follow_profile(seconds: float, running: Callable[[], bool]) -> None:
         while running():
             time.sleep(0.1)
             now = time.monotonic()
-            if _taken(reference):
+            if list(taken(reference)):
                 played, last = played + now - before, now
             before = now
-            told = _health(_taken(said)).items()
+            told = _health([message for message, _ in taken(said)]).items()
             health = next((what for who, what in told if who.endswith("motor_controller")), health)
             if played >= seconds + REST:
                 return
@@ -158,15 +158,6 @@ def follow_profile(seconds: float, running: Callable[[], bool]) -> None:
                 raise HannesError(
                     f'The profile {what}; the controller says "{health}". What came is in the bag; record again.'
                 )
-
-
-def _taken(subscription: Subscription) -> list[bytes]:
-    """The serialised messages that have come since the last time."""
-    messages, handle = [], subscription.handle
-    with handle:
-        while (message := handle.take_message(subscription.msg_type, True)) is not None:
-            messages.append(message[0])
-    return messages
 
 
 def _never_called(data: bytes) -> None:

@@ -82,9 +82,8 @@ def add_effects(
         progress(k, len(sources), f"fit with {name}")
         best = search.polish(search.add(best, name))
     # As a diagnosis does: noise and scatter are estimated where the fit has come.
-    first, search = search, search.renewed(best)
-    (again,) = search.refitted([best])
-    best = search.with_spread(search.polish(again))
+    first, (search, best) = search, search.fitted_afresh(best)
+    best = search.with_spread(best)
     limits = chance(search.problem, best.fit, search.signatures(best))
     falls = error_falls(replace(prepared, problem=search.problem), search, best, first=first)
     return Addition(

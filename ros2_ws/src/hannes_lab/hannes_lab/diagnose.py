@@ -241,9 +241,7 @@ def _named_instead(choice: Choice, search: Search) -> tuple[Search, Choice]:
     if instead.penalised > best.penalised:
         return search, choice
     other.null()  # from there the new search's nominal is fitted
-    new = other.renewed(instead)
-    (refitted,) = new.refitted([instead])
-    again = new.polish(refitted)
+    new, again = other.fitted_afresh(instead)
     limits = chance(new.problem, again.fit, new.signatures(again))
     if not is_adequate(new, again, limits):
         return search, choice

@@ -396,7 +396,7 @@ class PlantRig:
         """Parameters of the plant by name, for one trial."""
         wanted = dict(self._of(model)[1])
         for name, value in values.items():
-            parameter, _, where = name.partition("@") if "@" in name else (name, "", "")
+            parameter, _, where = name.partition("@")
             if not where or where == trial.name:
                 wanted[parameter] = value
         return wanted

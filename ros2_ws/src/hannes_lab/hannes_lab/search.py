@@ -456,6 +456,12 @@ class Search:
         )
         return self._emptied(problem=problem, before=self.found.get((), self.before))
 
+    def fitted_afresh(self, best: Candidate) -> tuple[Search, Candidate]:
+        """The search with noise and scatter estimated at a candidate, and the candidate fitted to the end in it."""
+        new = self.renewed(best)
+        (again,) = new.refitted([best])
+        return new, new.polish(again)
+
     def with_nuisances(self, nuisances: Sequence[Nuisance]) -> Search:
         """The same search with other nuisance parameters; nothing that was found holds for it."""
         return self._emptied(nuisances=nuisances)

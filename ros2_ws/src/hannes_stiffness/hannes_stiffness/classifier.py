@@ -85,7 +85,7 @@ def save(
     sure       least probability of a sure answer
     estimator  the regression of the stiffness
     """
-    path = new_file(path)
+    path = _onnx_path(path)
     parts = {_PROBABILITIES: model}
     if estimator is not None:
         parts |= {_VALUE: estimator.value, _SPREAD: estimator.spread}
