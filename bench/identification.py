@@ -42,15 +42,15 @@ from joblib import Parallel, delayed
 
 SETS = ("nothing", "single", "pairs", "outside", "typical", "strong", "shapes", "logging", "mismatch")
 SHAPES = {
-    "cogging": (0.6, 1.1, 2.3, 4.2, 9.0, 13.0, 20.0),
-    "stribeck_friction": (0.1, 0.6, 2.0, 10.0),
-    "presliding_friction": (0.015, 0.2, 1.5),
-    "glove_hysteresis": (0.05, 1.2, 10.0),
-    "winding_heating": (4.0, 35.0, 300.0),
-    "velocity_strengthening": (0.1, 0.6, 1.8),
-    "load_dependent_friction": (0.3, 0.7, 1.0),
+    ("cogging", "period"): (0.6, 1.1, 2.3, 4.2, 9.0, 13.0, 20.0),
+    ("stribeck_friction", "velocity"): (0.1, 0.6, 2.0, 10.0),
+    ("presliding_friction", "length"): (0.015, 0.2, 1.5),
+    ("glove_hysteresis", "relaxation"): (0.05, 1.2, 10.0),
+    ("winding_heating", "time_constant"): (4.0, 35.0, 300.0),
+    ("velocity_strengthening", "velocity"): (0.1, 0.6, 1.8),
+    ("load_dependent_friction", "share"): (0.3, 0.7, 1.0),
 }
-"""Values of each effect's one shape parameter."""
+"""Values of a shape parameter of each effect."""
 LOGGED = (
     "viscous_friction",
     "load_dependent_friction",
@@ -257,9 +257,8 @@ def cases(kinds: list[str], limits: dict[str, float], quick: bool, first: int = 
         strong = [(name, strength(name, min(STRONG, highest_factor(name)))) for name in names]
         out += [Case("strong", (one,), STRONG, first + 80_000 + k) for k, one in enumerate(strong)]
     if "shapes" in kinds:
-        different = [(name, value) for name, values in SHAPES.items() for value in values]
-        for k, (name, value) in enumerate(different):
-            (shape,) = [p.name for p in load_effect(name).parameters if p.vanishing is None]
+        different = [(*which, value) for which, values in SHAPES.items() for value in values]
+        for k, (name, shape, value) in enumerate(different):
             given = {**dict(strength(name, 1.0)), shape: value}
             out.append(Case("shapes", ((name, tuple(given.items())),), 1.0, first + 70_000 + k))
     if "logging" in kinds:

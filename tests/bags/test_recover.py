@@ -1,6 +1,7 @@
 """What `recover` saves."""
 
 import json
+import re
 import shutil
 import sqlite3
 from pathlib import Path
@@ -246,6 +247,18 @@ def test_the_command_that_tells_what_is_in_a_bag(tmp_path: Path) -> None:
     assert told.exit_code == 0 and "/hannes/motor/voltage" in told.output and "sha256" in told.output
     content = json.loads(CliRunner().invoke(app, [str(bag), "--json"]).output)
     assert content["sha256"] == read_bag(bag).sha256 and content["metadata"]["condition"] == "slow"
+    two = long_bag(tmp_path / "two")
+    told = CliRunner().invoke(app, [str(tmp_path)])
+    assert told.exit_code == 0 and re.findall(r"^\S+: mcap", told.output, re.M) == [
+        f"{bag}: mcap",
+        f"{two}: mcap",
+    ]
+    both = json.loads(CliRunner().invoke(app, [str(tmp_path), "--json"]).output)
+    assert [one["path"] for one in both] == [str(bag), str(two)]
+    for file in two.glob("*.mcap"):
+        file.write_bytes(file.read_bytes()[:-100])
+    told = CliRunner().invoke(app, [str(tmp_path)])
+    assert f"{bag}: mcap" in told.output and "1 of 2 bags" in str(told.exception)
     (bag / "metadata.yaml").unlink()
     assert recover(bag, tmp_path / "saved").as_dict()["messages"] == content["message_count"]
     saving = typer.Typer()

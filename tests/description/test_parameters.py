@@ -180,3 +180,13 @@ def test_unreadable_and_missing_files(tmp_path: Path) -> None:
         Model.load(tmp_path / "none.yaml")
     with pytest.raises(HannesError, match="nominal"):
         Model.load("none")
+
+
+def test_an_effect_file_that_has_moved_is_told_with_its_model_file(tmp_path: Path) -> None:
+    effect = "effects: [{name: mine, source: 'mine.py:Mine', parameters: {}}]\n"
+    (tmp_path / "hand.yaml").write_text(f"schema: hannes/model/1\n{effect}")
+    (tmp_path / "mine.py").touch()
+    assert Model.load(tmp_path / "hand.yaml").effects[0].source == f"{tmp_path / 'mine.py'}:Mine"
+    (tmp_path / "mine.py").unlink()
+    with pytest.raises(HannesError, match=r"hand\.yaml: effect 'mine' .* 'mine\.py:Mine'.*`source`"):
+        Model.load(tmp_path / "hand.yaml")

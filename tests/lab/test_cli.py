@@ -65,6 +65,8 @@ def test_diagnose_add_and_report(
     assert code == 0 and content["verdict"] == "effects"
     assert [e["name"] for e in content["effects"]] == ["glove_stiffness"]
     assert [e.name for e in Model.load(model).effects] == ["glove_stiffness"]
+    assert content["model"] == {"name": "nominal", "sha256": Model.load().sha256}
+    assert content["fitted_model"]["sha256"] == Model.load(model).sha256
     assert "glove" in page.read_text(encoding="utf-8") and content["model_file"] == str(model)
     # all is in the store now; the verdict is seen though its report fails
     words = ("diagnose", str(bags), *only, "--jobs", "1", "--report", "/dev/full")
@@ -264,6 +266,7 @@ def test_a_full_output_is_one_line_and_a_reader_that_has_gone_none(
         (("--effect", "load_dependent_friction=-1"), "coefficient would be -0.1"),
         (("--effect", "cogging=0"), "but not 0"),
         (("--effect", "cogging=inf"), "but not 0"),
+        (("--effect", "cogging", "--effect", "cogging=3"), "cogging is given more than once"),
         (("--condition", "fast", "--condition", "fast"), "fast is asked for more than once"),
         (("--seed", "-3"), "greater than or equal to 0"),
     ],

@@ -222,7 +222,8 @@ def make_diagnosis(verdict: str) -> dict[str, Any]:
         "notes": ["stiffness and preload cannot be told apart well"],
         "simulations": 22777,
         "data": make_comparison()["data"],
-        "model": {"name": "nominal", "sha256": "ef" * 32},
+        "model": {"name": "nominal", "sha256": "ab" * 32},
+        "fitted_model": {"sha256": "ef" * 32},
     }
 
 
@@ -428,8 +429,8 @@ def test_notes_come_after_the_verdict_long_ones_folded() -> None:
 def test_models_are_told_apart_by_name() -> None:
     after = make_comparison(off=0.05) | {"model": {"name": "nominal", "sha256": "ef" * 32}}
     words = page_of(comparison=make_comparison(), after=after, diagnosis=make_diagnosis("effects")).words
-    assert f"before nominal sha256 {'ab' * 32}" in words
-    assert f"after, diagnosed nominal + glove_stiffness sha256 {'ef' * 32}" in words
+    assert f"before, diagnosed nominal sha256 {'ab' * 32}" in words
+    assert f"after nominal + glove_stiffness sha256 {'ef' * 32}" in words
 
 
 def test_no_excess_is_not_shared_out() -> None:

@@ -241,8 +241,12 @@ def _read_effects(content: object, where: str, folder: Path) -> tuple[EffectEntr
             str(n): Parameter.from_dict(f"{item['name']}.{n}", p, where)
             for n, p in item["parameters"].items()
         }
-        source = item.get("source")
-        entries.append(
-            EffectEntry(str(item["name"]), parameters, _beside(str(source), folder) if source else None)
-        )
+        source = _beside(str(item["source"]), folder) if item.get("source") else None
+        file = source.rpartition(":")[0] if source else ""
+        if file and not Path(file).expanduser().is_file():
+            raise HannesError(
+                f"{where}: effect '{item['name']}' is to come from '{source}', but there is no such file; where it "
+                "has moved, correct that effect's `source`."
+            )
+        entries.append(EffectEntry(str(item["name"]), parameters, source))
     return tuple(entries)

@@ -13,7 +13,7 @@ from hannes_sim.plant import PlantDiverged
 
 from .chance import chance
 from .diagnose import fitted_model, found_effects
-from .diagnosis import Fall, FoundEffect
+from .diagnosis import Fall, FoundEffect, both_models
 from .executor import Executor
 from .falls import error_falls, fall_sentence
 from .features import data_used
@@ -23,8 +23,12 @@ from .search import Progress, Search, silent
 
 @dataclass(frozen=True)
 class Addition:
-    """The model with the effects, and what they are worth on data that took no part in their fit."""
+    """The model with the effects, and what they are worth on data that took no part in their fit.
 
+    given   the model to which they were added
+    """
+
+    given: Model
     model: Model
     effects: tuple[FoundEffect, ...]
     falls: tuple[Fall, ...]
@@ -47,7 +51,7 @@ class Addition:
             },
             "data": [dict(d) for d in self.data],
             "notes": list(self.notes),
-            "model": {"name": self.model.name, "sha256": self.model.sha256},
+            **both_models(self.given, self.model),
         }
 
 
@@ -87,6 +91,7 @@ def add_effects(
     limits = chance(search.problem, best.fit, search.signatures(best))
     falls = error_falls(replace(prepared, problem=search.problem), search, best, first=first)
     return Addition(
+        prepared.model,
         with_provenance(fitted_model(prepared.model, search, best, limits), prepared, falls),
         found_effects(search, best, limits, falls),
         falls,

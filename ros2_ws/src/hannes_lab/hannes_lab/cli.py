@@ -628,6 +628,8 @@ def hide(
     wanted: dict[str, float] = {}
     for text in effects or ():
         name, _, factor = text.partition("=")
+        if name in wanted:
+            raise HannesError(f"--effect {name} is given more than once; give one factor.")
         try:
             wanted[name] = float(factor) if factor else 1.0
         except ValueError as error:

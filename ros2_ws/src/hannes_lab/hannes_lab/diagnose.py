@@ -149,6 +149,7 @@ def diagnose(
         ),
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
+        given=prepared.model,
         model=fitted_model(prepared.model, search, best, limits),
         values=best.fit.values,
     )

@@ -96,9 +96,21 @@ class Rank:
         return {"names": list(self.names), "cost": self.cost, "explained": self.explained}
 
 
+def both_models(given: Model, fitted: Model) -> dict[str, Any]:
+    """What an answer says of the model that was given and of the fitted one, with its effects, for a report."""
+    return {
+        "model": {"name": given.name, "sha256": given.sha256},
+        "fitted_model": {"sha256": fitted.sha256},
+    }
+
+
 @dataclass(frozen=True)
 class Diagnosis:
-    """The answer; `to_dict` is what --json, the report and the page show."""
+    """The answer; `to_dict` is what --json, the report and the page show.
+
+    given   the model in which effects were looked for
+    model   the same with what was found, fitted; `values` are those of all that was free
+    """
 
     verdict: str
     summary: str
@@ -114,6 +126,7 @@ class Diagnosis:
     notes: tuple[str, ...]
     simulations: int
     data: tuple[Mapping[str, Any], ...]
+    given: Model
     model: Model
     values: Mapping[str, float]
 
@@ -141,5 +154,5 @@ class Diagnosis:
             "notes": list(self.notes),
             "simulations": self.simulations,
             "data": [dict(d) for d in self.data],
-            "model": {"name": self.model.name, "sha256": self.model.sha256},
+            **both_models(self.given, self.model),
         }

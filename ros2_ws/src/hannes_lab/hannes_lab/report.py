@@ -702,8 +702,8 @@ def _models(comparison: Part | None, after: Part | None, diagnosis: Part | None)
     added = "".join(f" + {e.get('name', '')}" for e in _list(diagnosis, "effects"))
     rows = [
         ("before" if after is not None else "compared", comparison, ""),
+        ("diagnosed", diagnosis, ""),
         ("after", after, added),
-        ("diagnosed", diagnosis, added),
     ]
     out: list[dict[str, str]] = []
     for role, part, more in rows:
