@@ -13,10 +13,11 @@ from typing import Annotated, Any, cast
 import numpy as np
 import typer
 from hannes_description.errors import HannesError
+from hannes_description.output import number, print_json, text_console, with_unit
 from numpy.typing import NDArray
 
 from .cache import code_hash, content_hash, default_folder
-from .cli import Scale, Topics, _command, _console, _number, _prepared, _print_json, _Progress, _with_unit
+from .cli import Scale, Topics, _command, _prepared, _Progress
 from .cli_files import check_model_file
 from .errors import held_out_closures, overall, signal_errors
 from .executor import interruptible
@@ -285,7 +286,7 @@ def command(
     )
     try:
         if json:
-            _print_json(found.to_dict() | {"model_file": str(out)})
+            print_json(found.to_dict() | {"model_file": str(out)})
         else:
             _show(found)
     finally:
@@ -295,11 +296,11 @@ def command(
 
 
 def _show(found: Calibration) -> None:
-    console = _console()
+    console = text_console()
     for p in found.parameters:
         note = "" if p.identified else "   not identified"
         console.print(
-            f"{p.name} = {_with_unit(p.value, p.unit)}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
+            f"{p.name} = {with_unit(p.value, p.unit)}   95 %: {number(p.low)} .. {number(p.high)}{note}"
         )
     console.print(
         f"{found.agree} of {len(found.costs)} starts agree; {found.simulations} simulations, "
@@ -308,7 +309,7 @@ def _show(found: Calibration) -> None:
     if any(map(math.isfinite, found.errors.values())):
         console.print(
             "Error in multiples of the repeatability: "
-            + ", ".join(f"{k.replace('_', ' ')} {_number(v, 3)}" for k, v in found.errors.items())
+            + ", ".join(f"{k.replace('_', ' ')} {number(v, 3)}" for k, v in found.errors.items())
         )
     for text in found.warnings:
         console.print(f"warning: {text}", style="dim", markup=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import math
 import shlex
 import sys
@@ -16,11 +15,19 @@ import numpy as np
 import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.output import (
+    TEXT_WIDTH,
+    finite,
+    number,
+    print_json,
+    show_table,
+    text_console,
+    with_unit,
+)
 from hannes_description.signals import SIGNALS
 from hannes_sim.effect import effect_source, load_effect, strength_of
 from joblib import cpu_count
 from rich.console import Console
-from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -244,46 +251,6 @@ def _check_effects(prepared: Prepared, sources: Sequence[str]) -> None:
     check_own_effects(sources, simulate, (np.asarray(ticks * trial.period), reference[ticks]))
 
 
-def _print_json(content: dict[str, Any]) -> None:
-    typer.echo(json_module.dumps(_finite(content), indent=2))
-
-
-def _finite(content: Any) -> Any:
-    """JSON has no NaN: unknown numbers become null."""
-    if isinstance(content, dict):
-        return {key: _finite(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [_finite(value) for value in content]
-    if isinstance(content, float) and not math.isfinite(content):
-        return None
-    return content
-
-
-def _number(value: float, digits: int = 4) -> str:
-    return f"{value:.{digits}g}" if math.isfinite(value) else "-"
-
-
-def _with_unit(value: float, unit: str, digits: int = 4) -> str:
-    """A number with its unit; one without a dimension alone."""
-    return _number(value, digits) if unit in ("", "1") else f"{_number(value, digits)} {unit}"
-
-
-PIPED = 110
-"""Columns of what is no terminal, and of a table whose numbers a narrower one would cut."""
-
-
-def _console() -> Console:
-    return Console(width=None if sys.stdout.isatty() else PIPED, highlight=False)
-
-
-def _print_table(console: Console, table: Table) -> None:
-    """The table, wider than a narrow terminal where its numbers would be cut."""
-    whole = Measurement.get(console, console.options.update(max_width=1000), table).maximum
-    if console.width < min(whole, PIPED):
-        console = Console(width=min(whole, PIPED), highlight=False)
-    console.print(table)
-
-
 def _command() -> str:
     return "hannes " + " ".join(shlex.quote(a) for a in sys.argv[1:])
 
@@ -314,7 +281,7 @@ def compare(
         result = compare_model(prepared, fitted=fitted, executor=executor, progress=progress)
     try:
         if json:
-            _print_json(result.to_dict())
+            print_json(result.to_dict())
         else:
             _show_comparison(result)
     finally:  # whoever reads the answer may be gone
@@ -324,7 +291,7 @@ def compare(
 
 
 def _show_comparison(result: Comparison) -> None:
-    console = _console()
+    console = text_console()
     table = Table(title=f"Error of model '{result.model.name}'" + (" (fitted)" if result.fitted else ""))
     for name in ("condition", "signal", "phase", "RMSE", "bias", "repeatability", "ratio", ""):
         table.add_column(name, justify="left" if name in ("condition", "signal", "phase", "") else "right")
@@ -333,15 +300,15 @@ def _show_comparison(result: Comparison) -> None:
             c.condition,
             c.signal,
             c.phase,
-            _with_unit(c.rmse, c.unit, 3),
-            _number(c.bias, 3),
-            _number(c.repeatability, 3),
-            _number(c.ratio, 3),
+            with_unit(c.rmse, c.unit, 3),
+            number(c.bias, 3),
+            number(c.repeatability, 3),
+            number(c.ratio, 3),
             "fails" if c.fails else "",
         )
     if any(c.fails for c in result.cells):
         table.caption = "fails: the mean over the closures is further off than their scatter makes it"
-    _print_table(console, table)
+    show_table(table, TEXT_WIDTH)
     table = (
         Table(title="Figures of the thesis") if result.metrics else Table(show_header=False, show_edge=False)
     )
@@ -353,12 +320,12 @@ def _show_comparison(result: Comparison) -> None:
         table.add_row(
             m.condition,
             m.name,
-            _with_unit(m.measured, m.unit),
-            _number(m.sd, 2),
-            _number(m.model),
+            with_unit(m.measured, m.unit),
+            number(m.sd, 2),
+            number(m.model),
             _relative_error(m),
         )
-    _print_table(console, table)
+    show_table(table, TEXT_WIDTH)
     if result.metrics:
         console.print("Relative error: (measured - model) / measured.", style="dim")
     console.print(
@@ -366,10 +333,10 @@ def _show_comparison(result: Comparison) -> None:
         + ", ".join(f"{d.variable} {100 * d.share:.0f} %" for d in result.depends_on)
     )
     if math.isfinite(result.overall):
-        console.print(f"Overall error: {_number(result.overall)} times the repeatability between closures.")
+        console.print(f"Overall error: {number(result.overall)} times the repeatability between closures.")
     else:
         units = {e.signal: e.unit for e in result.errors}
-        each = ", ".join(f"{_with_unit(v, units[s], 3)} ({s})" for s, v in result.by_signal.items())
+        each = ", ".join(f"{with_unit(v, units[s], 3)} ({s})" for s, v in result.by_signal.items())
         console.print(f"Overall error: {each}. {NO_REPEATS}")
     for note in result.notes:
         console.print(f"note: {note}", style="dim")
@@ -381,7 +348,7 @@ def _relative_error(row: MetricRow) -> str:
         return "-"
     ratio = row.model / row.measured
     if abs(ratio) < MANY_TIMES:
-        return f"{_number(row.relative_error_percent, 3)} %"
+        return f"{number(row.relative_error_percent, 3)} %"
     return f"{abs(ratio):.2g} x too large" + (", other sign" if ratio < 0.0 else "")
 
 
@@ -426,7 +393,7 @@ def diagnose(
         )
     try:
         if json:
-            _print_json(found.to_dict() | {"model_file": str(out) if add else None})
+            print_json(found.to_dict() | {"model_file": str(out) if add else None})
         else:
             _show_diagnosis(found, prepared.rig.machine)
     finally:
@@ -448,14 +415,14 @@ def _report_of(path: Path, prepared: Prepared, found: Diagnosis | Addition) -> N
 
 
 def _show_diagnosis(found: Diagnosis, machine: str) -> None:
-    console = _console()
+    console = text_console()
     console.print(f"[bold]{found.verdict.upper()}[/bold]  {found.summary}")
     for effect in found.effects:
         console.print(f"\n[bold]{effect.title}[/bold] ({effect.name})")
         for name, p in effect.parameters.items():
             note = "" if p.identified else "   not identified by these data"
             console.print(
-                f"  {name} = {_with_unit(p.value, p.unit)}   95 %: {_number(p.low)} .. {_number(p.high)}{note}"
+                f"  {name} = {with_unit(p.value, p.unit)}   95 %: {number(p.low)} .. {number(p.high)}{note}"
             )
         console.print(f"  {effect.why}")
     _show_falls(console, found, machine)
@@ -477,7 +444,7 @@ def _show_experiments(console: Console, experiments: Sequence[Experiment]) -> No
     for experiment in (e for e in experiments if e.distance >= VISIBLE):
         tied = ", ".join(" + ".join(names) for names in experiment.separates)
         console.print(
-            f"\nTo tell apart {tied}: {experiment.name} (they differ by {_number(experiment.distance, 3)} standard "
+            f"\nTo tell apart {tied}: {experiment.name} (they differ by {number(experiment.distance, 3)} standard "
             f"deviations of the noise there)\n  {experiment.to_dict()['command']}"
         )
 
@@ -489,7 +456,7 @@ _LISTED = 3
 def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> None:
     units = {s.signal: s.unit for fall in found.falls for s in fall.signals}
     if not math.isfinite(found.falls[-1].held_out):
-        _show_falls_in_units(console, found, units)
+        _show_falls_in_units(found, units)
         return
     table = Table(
         title=f"Error, in multiples of the repeatability between closures (1 = as good as the {machine} repeats)"
@@ -504,19 +471,19 @@ def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> 
     for k, fall in enumerate(found.falls):
         if len(fall.by_condition) > _LISTED:
             worst = max(fall.by_condition, key=fall.by_condition.__getitem__)
-            conditions = f"at most {_number(fall.by_condition[worst], 3)}, {worst}"
+            conditions = f"at most {number(fall.by_condition[worst], 3)}, {worst}"
         else:
-            conditions = ", ".join(f"{c} {_number(v, 3)}" for c, v in fall.by_condition.items())
+            conditions = ", ".join(f"{c} {number(v, 3)}" for c, v in fall.by_condition.items())
         if len(fall.by_condition) > 1:
-            conditions = f"{_number(fall.held_out_conditions, 3)} ({conditions})"
+            conditions = f"{number(fall.held_out_conditions, 3)} ({conditions})"
         table.add_row(
             ("+ " if k > 1 else "") + fall.added,
-            _number(fall.train, 3),
-            _number(fall.held_out, 3),
+            number(fall.train, 3),
+            number(fall.held_out, 3),
             conditions,
-            *(_number(fall.held_out_signals.get(s, math.nan), 3) for s in signals),
+            *(number(fall.held_out_signals.get(s, math.nan), 3) for s in signals),
         )
-    _print_table(console, table)
+    show_table(table, TEXT_WIDTH)
     if signals:
         console.print("The last columns: error of each signal on held-out conditions.", style="dim")
 
@@ -526,7 +493,7 @@ def _heading(signal: str, unit: str) -> str:
     return signal.replace("_", "\n", 1) + ("" if unit == "1" else f", {unit}")
 
 
-def _show_falls_in_units(console: Console, found: Diagnosis | Addition, units: dict[str, str]) -> None:
+def _show_falls_in_units(found: Diagnosis | Addition, units: dict[str, str]) -> None:
     """The table where nothing was repeated: there is no repeatability to give the errors in."""
     held, steps = errors_in_units([fall.to_dict() for fall in found.falls])
     table = Table(title="Error on conditions that were left out of the fit" if held else "Error of the fit")
@@ -535,9 +502,9 @@ def _show_falls_in_units(console: Console, found: Diagnosis | Addition, units: d
         table.add_column(_heading(signal, units[signal]), justify="right")
     for k, (fall, errors) in enumerate(zip(found.falls, steps, strict=True)):
         table.add_row(
-            ("+ " if k > 1 else "") + fall.added, *(_number(errors.get(s, math.nan), 3) for s in steps[-1])
+            ("+ " if k > 1 else "") + fall.added, *(number(errors.get(s, math.nan), 3) for s in steps[-1])
         )
-    _print_table(console, table)
+    show_table(table, TEXT_WIDTH)
 
 
 @interruptible
@@ -570,7 +537,7 @@ def add(
         )
     try:
         if json:
-            _print_json(found.to_dict() | {"model_file": str(out)})
+            print_json(found.to_dict() | {"model_file": str(out)})
         else:
             _show_addition(found, prepared.rig.machine)
     finally:
@@ -583,10 +550,10 @@ def add(
 
 
 def _show_addition(found: Addition, machine: str) -> None:
-    console = _console()
+    console = text_console()
     for effect in found.effects:
         values = ", ".join(
-            f"{n} = {_with_unit(p.value, p.unit)} ({_number(p.low, 3)} .. {_number(p.high, 3)})"
+            f"{n} = {with_unit(p.value, p.unit)} ({number(p.low, 3)} .. {number(p.high, 3)})"
             for n, p in effect.parameters.items()
         )
         console.print(f"[bold]{effect.title}[/bold]: {values}")
@@ -657,7 +624,7 @@ def hide(
     )
     bags = write_set(recordings, hidden, out, truth)
     if json:
-        _print_json({"bags": [str(b) for b in bags], "truth": str(truth)})
+        print_json({"bags": [str(b) for b in bags], "truth": str(truth)})
         return
     typer.echo(f"{len(bags)} bags in {out}, the truth in {truth}")
 
@@ -707,7 +674,7 @@ def report(
         )
     try:
         if json:
-            _print_json({"report": str(out), "verdict": found.verdict})
+            print_json({"report": str(out), "verdict": found.verdict})
         else:
             typer.echo(found.summary)
     finally:
@@ -722,9 +689,9 @@ def _write_report(
     from .report import write_report
 
     parts = {
-        "comparison": _finite(comparison.to_dict()),
-        "after": _finite(after.to_dict()) if after else None,
-        "diagnosis": _finite(diagnosis.to_dict()) if diagnosis else None,
+        "comparison": finite(comparison.to_dict()),
+        "after": finite(after.to_dict()) if after else None,
+        "diagnosis": finite(diagnosis.to_dict()) if diagnosis else None,
         "title": "Hannes: model against measurement",
     }
     if path.suffix.lower() in ENDINGS:

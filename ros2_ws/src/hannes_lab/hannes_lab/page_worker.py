@@ -20,10 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from hannes_description.errors import HannesError
+from hannes_description.output import finite
 from hannes_sim.effect import catalogue
 
 from .add import Addition, add_effects, with_provenance
-from .cli import _after, _check_effects, _executor, _finite, _prepared
+from .cli import _after, _check_effects, _executor, _prepared
 from .compare import compare
 from .diagnose import diagnose, effect_sources
 from .diagnosis import Diagnosis
@@ -62,7 +63,7 @@ def main(folder: Path) -> int:
     threading.Thread(target=_end_when_left, daemon=True).start()
 
     def say(message: Mapping[str, Any]) -> None:
-        print(json.dumps(_finite(message)), file=out, flush=True)
+        print(json.dumps(finite(message)), file=out, flush=True)
 
     try:
         work(json.loads((folder / "task.json").read_text(encoding="utf-8")), folder, say)
@@ -123,9 +124,9 @@ def work(task: Mapping[str, Any], folder: Path, say: Say) -> None:
         _check_effects(prepared, wanted)
         with _executor(task["jobs"], None, False) as executor:
             found = _find(task, prepared, executor, progress)
-    comparison = _finite(before.to_dict())
-    after = _finite(_after(prepared, found).to_dict()) if found else None
-    answer = _finite(found.to_dict()) if found else comparison
+    comparison = finite(before.to_dict())
+    after = finite(_after(prepared, found).to_dict()) if found else None
+    answer = finite(found.to_dict()) if found else comparison
     shown: dict[str, Any] = {"comparison": comparison, "after": after, "diagnosis": answer if found else None}
     command = command_line(task)
     files = [REPORT, ANSWER]

@@ -19,6 +19,7 @@ from typing import Any
 
 from hannes_description.errors import HannesError
 from hannes_description.files import write_whole
+from hannes_description.output import finite
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -187,7 +188,7 @@ def notes(parts: Sequence[Part | None]) -> dict[str, list[dict[str, str]]]:
 
 def embedded_json(data: Any) -> str:
     """JSON that may stand inside a script element: no NaN (null instead), nothing that could end the element."""
-    body = json.dumps(_finite(data), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    body = json.dumps(finite(data), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for sign in "<>&\u2028\u2029":
         body = body.replace(sign, f"\\u{ord(sign):04x}")
     return body
@@ -736,17 +737,6 @@ def _occurrences(rows: Sequence[Part]) -> dict[tuple[str, str, int], int]:
 def _list(part: Part | None, key: str) -> list[Any]:
     value = (part or {}).get(key)
     return list(value) if isinstance(value, list | tuple) else []
-
-
-def _finite(data: Any) -> Any:
-    """The same data with None for what JSON cannot say."""
-    if isinstance(data, Mapping):
-        return {str(k): _finite(v) for k, v in data.items()}
-    if isinstance(data, list | tuple):
-        return [_finite(v) for v in data]
-    if isinstance(data, float) and not math.isfinite(data):
-        return None
-    return data
 
 
 def _asset(name: str) -> str:

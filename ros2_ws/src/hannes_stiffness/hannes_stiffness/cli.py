@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.output import print_json, print_table
 from hannes_description.signals import STIFFNESS_CLASSES
 
 if TYPE_CHECKING:
@@ -254,7 +254,7 @@ def _say(text: str) -> None:
 
 def _show(result: dict[str, Any], as_json: bool, table: Callable[[], None]) -> None:
     if as_json:
-        print(json.dumps(result, indent=2, allow_nan=False))
+        print_json(result)
     else:
         table()
 
@@ -268,15 +268,7 @@ def _percent(value: float | None) -> str:
 
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for k, column in enumerate(columns):
-        table.add_column(column, justify="left" if k == 0 else "right")
-    for row in rows:
-        table.add_row(*row)
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    print_table("", columns, rows, right=range(1, len(columns)))
 
 
 def _row(name: str, score: dict[str, Any]) -> list[str]:

@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 import typer
 from hannes_description.errors import HannesError
+from hannes_description.output import print_json
 
-from .output import JsonOption, print_json
+from .options import JsonOption
 
 TopicOption = Annotated[
     list[str] | None, typer.Option("--topic", help="Only this topic; may be given several times.")

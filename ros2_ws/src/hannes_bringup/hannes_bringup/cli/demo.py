@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.output import print_json
 
-from .output import JsonOption, print_json
+from .options import JsonOption
 
 if TYPE_CHECKING:
     from hannes_bags.recording import Recording

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from hannes_description.output import number, print_json, print_table
 
-from .output import JsonOption, number, print_json, print_table
+from .options import JsonOption
 
 app = typer.Typer(
     help="Models: nominal parameters plus effects.",

@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 from hannes_description.errors import HannesError
+from hannes_description.output import print_json
 
-from .output import JsonOption, print_json
+from .options import JsonOption
 
 
 class Wanted(StrEnum):

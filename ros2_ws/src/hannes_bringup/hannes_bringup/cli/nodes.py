@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from hannes_description.output import number, print_json, print_table
 
-from .output import JsonOption, number, print_json, print_table
+from .options import JsonOption
 
 
 def nodes(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json as json_module
 import shlex
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,12 +11,11 @@ from typing import Annotated, Any
 import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.output import print_json, print_table, text_console
 from hannes_description.parameters import data_path
-from rich.console import Console
-from rich.table import Table
 
 from ..cache import default_folder
-from ..cli import _finite, _Progress
+from ..cli import _Progress
 from ..executor import interruptible
 from . import (
     columns,
@@ -203,7 +200,7 @@ def validate(
             "seconds": seconds,
             "sections": [s.to_dict() for s in sections],
         }
-        typer.echo(json_module.dumps(_finite(content), indent=2))
+        print_json(content)
         return
     _show(sections, rows)
     if rows is None:
@@ -211,15 +208,14 @@ def validate(
 
 
 def _show(sections: list[Section], rows: list[str] | None) -> None:
-    console = Console(width=None if sys.stdout.isatty() else 220, highlight=False)
+    console = text_console()
     for section in sections:
-        table = Table(title=section.title, title_justify="left", box=None, pad_edge=False)
-        for k, name in enumerate(HEADINGS):
-            table.add_column(name, justify="right" if 2 < k < 8 else "left")
-        for figure in section.figures:
-            if rows is None or any(figure.row == r or r in _expand(figure.row) for r in rows):
-                table.add_row(*(text.replace("**", "") for text in cells(figure)))
-        console.print(table)
+        shown = [
+            [text.replace("**", "") for text in cells(figure)]
+            for figure in section.figures
+            if rows is None or any(figure.row == r or r in _expand(figure.row) for r in rows)
+        ]
+        print_table(section.title, HEADINGS, shown, right=range(3, 8))
         for note in section.notes:
             console.print(f"note: {note}", style="dim", markup=False)
 

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from hannes_description.output import number
+
 Progress = Callable[[int, int, str], None]
 """Called with steps done, steps in all, and what is going on."""
 
@@ -115,11 +117,6 @@ def relative(desired: float, value: float) -> float:
     if not (math.isfinite(desired) and math.isfinite(value)) or desired == 0.0:
         return math.nan
     return (desired - value) / desired * 100.0
-
-
-def number(value: float, digits: int = 4) -> str:
-    """A number for a table; a dash where there is none."""
-    return f"{value:.{digits}g}" if math.isfinite(value) else "-"
 
 
 def percent(value: float) -> str:
