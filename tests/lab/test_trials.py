@@ -7,9 +7,12 @@ import pytest
 from hannes_bags.recording import Channel, Recording
 from hannes_control.reference import half_sine
 from hannes_description.errors import HannesError
+from hannes_description.model import Model
 from hannes_lab.adapter import check_trials
 from hannes_lab.blocks import in_blocks, told_apart
-from hannes_lab.prepare import without_outliers
+from hannes_lab.compare import compare
+from hannes_lab.hand import make_controller
+from hannes_lab.prepare import prepare, without_outliers
 from hannes_lab.trials import (
     Closure,
     Trial,
@@ -19,6 +22,8 @@ from hannes_lab.trials import (
     reference_on_grid,
     unique_names,
 )
+from hannes_sim.factory import make_plant
+from hannes_sim.rollout import rollout
 
 
 def recording(
@@ -291,6 +296,27 @@ def test_no_closure_and_no_signal_are_clear_errors() -> None:
     )
     with pytest.raises(HannesError, match="reference_position"):
         make_trial(only)
+
+
+def closed_every(period: float, said: dict[str, object]) -> Recording:
+    """The reduced hand with a control loop of this period, logged without noise."""
+    model = Model.load()
+    controller = make_controller(model, period)
+    run = rollout(make_plant(model), controller, half_sine(2, 10.0, 2.0, period), joints=False)
+    names = {"reference_position": run.reference_position, "encoder_position": run.encoder_position}
+    metadata = {"plant": "reduced", "object": "none", "sensors": {"current_rectified": False}, **said}
+    return Recording({n: Channel(run.time, v, "rad", n) for n, v in names.items()}, metadata, "memory")
+
+
+def test_the_control_period_is_what_the_recording_says() -> None:
+    errors = []
+    for said in ({"control_period": 0.004}, {}):
+        prepared = prepare([make_trial(closed_every(0.004, said))], Model.load())
+        errors.append(max(row.rmse for row in compare(prepared).errors))
+    assert errors[0] < 2e-4 and errors[1] > 10.0 * errors[0], errors
+    for wrong in (4.0, 0.0, True, "4 ms", float("nan")):
+        with pytest.raises(HannesError, match=r"memory: its `control_period`.*in seconds"):
+            make_trial(closed_every(0.004, {"control_period": wrong}))
 
 
 def test_names_of_trials_are_made_unique() -> None:

@@ -564,12 +564,15 @@ def _show_addition(found: Addition, machine: str) -> None:
 
 def hide(
     out: Annotated[Path, typer.Argument(help="Folder for the bags, one per condition.")],
-    truth: Annotated[Path, typer.Option("--truth", help="File for the truth; keep it away from the bags.")],
+    truth: Annotated[
+        Path, typer.Option("--truth", help="New file for the truth; keep it away from the bags.")
+    ],
     effects: Annotated[
         list[str] | None,
         typer.Option(
             "--effect",
-            help="NAME, NAME=FACTOR (times its typical strength), or path.py:Class; none: nothing hidden.",
+            help="NAME or path.py:Class, of typical strength, or with =FACTOR of so many times that; leave it "
+            "out to hide nothing.",
         ),
     ] = None,
     model: ModelFile = "nominal",

@@ -41,6 +41,9 @@ STRANGE_HOLD_RATE = 225.0
 """Hz; a reference logged at least this fast is what the controller received, message by message; a slower log has gaps
 that are filled by a smooth curve.  The second is for recordings that do not say how they were logged."""
 
+CONTROL_PERIOD = 1e-3
+CONTROL_PERIODS = (1e-4, 1e-1)
+"""s; that of a controller of which a recording says nothing, and the shortest and longest that may be said."""
 
 _NEGATIVE = 0.005
 """Part of the samples below nought, beyond noise, that a rectified current does not have."""
@@ -491,7 +494,6 @@ def make_trial(
     recording: Recording,
     *,
     name: str | None = None,
-    period: float = 1e-3,
     signals: Sequence[str] = SIGNALS,
     scale: Mapping[str, float] | None = None,
 ) -> Trial:
@@ -501,7 +503,7 @@ def make_trial(
     Raises HannesError where the recording has no reference or none of the signals.
     """
     (converted,) = in_si([compared(recording, signals)], scale or {})
-    return trial_of(converted, name=name, period=period)
+    return trial_of(converted, name=name)
 
 
 def compared(recording: Recording, signals: Sequence[str] = SIGNALS) -> Recording:
@@ -522,10 +524,23 @@ def compared(recording: Recording, signals: Sequence[str] = SIGNALS) -> Recordin
     return replace(recording, channels={s: recording[s] for s in ("reference_position", *present)})
 
 
-def trial_of(recording: Recording, *, name: str | None = None, period: float = 1e-3) -> Trial:
+def control_period(recording: Recording) -> float:
+    """Control period [s] that the recording's metadata say, or the usual one."""
+    given = recording.metadata.get("control_period", CONTROL_PERIOD)
+    low, high = CONTROL_PERIODS
+    if isinstance(given, bool) or not isinstance(given, int | float) or not low <= given <= high:
+        raise HannesError(
+            f"{recording.source}: its `control_period` is {given!r}; it must be the period of the control loop in "
+            f"seconds, {low:g} to {high:g}."
+        )
+    return float(given)
+
+
+def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     """The trial of a recording in SI with nothing but what is compared."""
     notes = list(recording.warnings)
     meta = recording.metadata
+    period = control_period(recording)
     name = name or str(meta.get("condition") or stem_of(recording.source))
     channel = recording["reference_position"]
     _check_overlap(recording)
