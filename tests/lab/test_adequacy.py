@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from hannes_description.model import Model
-from hannes_lab.adequacy import distorted, exaggerated, leads_back
+from hannes_lab.adequacy import distorted, exaggerated, in_the_law, leads_back, led_off
 from hannes_lab.diagnose import effect_sources
 from hannes_lab.fit import Fit
 from hannes_lab.hand import WIDE_STEP
@@ -35,6 +35,19 @@ def test_what_leads_a_known_parameter_back_is_worth_more() -> None:
     assert not leads_back(base, candidate((spring, 3.5), (wire, 0.0)))
     assert not leads_back(candidate((spring, 3.5), (wire, 0.0))), "nothing is far off"
     assert not leads_back(candidate((spring, 0.0), (wire, 6.0))), "a wide tolerance says nothing"
+
+
+def test_effects_that_take_a_known_parameter_far_off_replace_what_the_model_had() -> None:
+    """A drag that grows with the square of the speed is bent into a breakaway friction without any dry friction."""
+    dry, wire = (
+        nuisance_coordinate(Nuisance(name, 0.02, sd, True, step=step))
+        for name, sd, step in (("friction.coulomb", 0.1, 0.5), ("wire.stiffness", 1.0, WIDE_STEP))
+    )
+    base = candidate((dry, -1.3), (wire, 0.0))
+    said = led_off(base, candidate((dry, -9.0), (wire, 0.0)))
+    assert said.startswith("cogging would take friction.coulomb to") and "9 times its tolerance off" in said
+    assert not led_off(base, candidate((dry, -3.5), (wire, 6.0)))
+    assert not led_off(candidate((dry, -3.5)), candidate((dry, -9.0))), "it was off before"
 
 
 def test_an_effect_that_is_bent_into_another_one_explains_nothing() -> None:
@@ -82,3 +95,21 @@ def test_no_effect_far_stronger_than_usual_is_believed_of_another_machine() -> N
     assert not said(slack=3.9, stiffness=0.015)
     assert said(slack=4.8).startswith("wire_slack.slack would be 4.8 rad, 10 times what is typical")
     assert said(slack=0.5, stiffness=0.002, hardening=5e-5).startswith("glove_stiffness.hardening would be")
+
+
+def test_how_the_law_of_another_machine_sets_in_is_told_by_its_way() -> None:
+    recordings, _ = make_set(Model.load(), [], seed=5, closures=2, conditions=("slow",))
+    prepared = prepare([make_trial(r) for r in recordings], Model.load())
+    names = ("presliding_friction", "cogging")
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, effect_sources(only=names))
+    of = {c.name: c for c in effect_coordinates(load_effect("presliding_friction"))}
+    length = of["presliding_friction.length"]
+
+    def told(value: float) -> tuple[str, str]:
+        return in_the_law(search, replace(candidate((length, length.z(value))), names=names))
+
+    assert told(0.009) == ("", ""), "of a recording of this very simulator the law is exact"
+    search.problem.discrepancy = ((np.zeros(0, dtype=np.int64), np.zeros((0, 0))),)
+    assert told(0.03) == ("", "")
+    effect, how = told(0.009)
+    assert effect == "presliding_friction" and how.startswith("length 0.009 rad, 0.06") and "travel" in how

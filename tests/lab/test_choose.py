@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hannes_lab import choose as module
 from hannes_lab.chance import Chance
-from hannes_lab.choose import OWN_ERROR_PART, choose
+from hannes_lab.choose import OWN_ERROR_PART, choose, choose_greedily
 from hannes_lab.search import PENALTY, Candidate
 from hannes_lab.wording import nearest_sentence
 
@@ -127,3 +127,19 @@ def test_what_was_asked_of_the_nearest_effect_is_said(given: pytest.MonkeyPatch)
     assert choice.best.names == ()
     assert np.isclose(MORE.fit.cost, 920.0)
     assert "lowers the misfit by 80, and 120 are asked for" in nearest_sentence(choice)
+
+
+@pytest.mark.parametrize("why", ["", "a would take friction.coulomb far off"])
+@pytest.mark.parametrize("reason", ["disbelieved", "led_off"])
+def test_effects_that_only_replace_what_the_model_had_are_no_answer(
+    given: pytest.MonkeyPatch, why: str, reason: str
+) -> None:
+    """However much of the error on conditions that were left out they take."""
+    best = made(("a",), 500.0, 5.0)
+    grown = SimpleNamespace(best=best, first=(best,), errors=(4.0, 1.1), rivals=(), notes=())
+    given.setattr(module, "grow", lambda *args: grown)
+    given.setattr(module, "disbelieved", lambda search, c: why if reason == "disbelieved" else "")
+    given.setattr(module, "led_off", lambda base, c: why if reason == "led_off" else "")
+    choice = choose_greedily(search_of(NULL, best), NULL, LIMITS, 3)
+    assert choice.enough == choice.adequate == (not why)
+    assert any(why in note and "to 1.1 times" in note for note in choice.notes) == bool(why)

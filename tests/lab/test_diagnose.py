@@ -15,7 +15,7 @@ from hannes_lab.add import add_effects
 from hannes_lab.chance import chance
 from hannes_lab.choose import Choice, pruned, tie_width
 from hannes_lab.compare import compare
-from hannes_lab.diagnose import diagnose, effect_sources, without_idle
+from hannes_lab.diagnose import diagnose, effect_sources, without_idle, without_law
 from hannes_lab.diagnosis import Diagnosis, Fall
 from hannes_lab.falls import fall_sentence
 from hannes_lab.fit import Fit, fit
@@ -23,7 +23,7 @@ from hannes_lab.hide import DEFAULT_CONDITIONS, Truth, make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.search import Candidate, Search
 from hannes_lab.trials import make_trial
-from hannes_lab.wording import bent_sentence
+from hannes_lab.wording import bent_sentence, law_sentence
 from hannes_sim.effect import load_effect, strength_of
 
 CLOSURES = 8
@@ -229,6 +229,9 @@ def test_where_the_model_has_an_error_of_its_own_an_effect_must_lower_the_error(
     back, falls = without_idle(single, alone)
     assert back.best is one and falls == alone, "what leads a parameter back stays"
     assert "glove_stiffness the model foretells as well, but only with hand.coulomb 0.0136" in back.notes[-1]
+    worse = (fall("nominal, as given", 2.1), begin[1], fall("glove_stiffness", 2.0))
+    about.found[()] = Candidate((), replace(null.fit, z=np.zeros(null.fit.z.size), cost=limits.misfit), 0.0)
+    assert without_idle(single, worse)[0].best.names == (), "as it was given the model foretells as well"
     unrepeated = (*begin[:2], fall("glove_stiffness", math.nan))
     assert without_idle(single, unrepeated) == (single, unrepeated), "nothing was left out"
     known = Choice(search, both, limits, True, ())
@@ -474,6 +477,22 @@ def test_a_glove_is_told_from_the_hands_own_spring_as_far_as_the_tolerance_of_th
     assert here == pytest.approx(total, rel=0.02)
 
 
+def test_how_another_machines_law_sets_in_is_not_named_where_the_rest_explains_all(
+    gloved: Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    null = gloved.null()
+    limits = chance(gloved.problem, null.fit, gloved.signatures(null))
+    about = copy_of(gloved, problem=replace(gloved.problem, discrepancy=(OWN_ERROR,)))
+    choice = Choice(about, gloved.fitted(("gravity", "glove_stiffness")), limits, True, ())
+    assert without_law(choice) is choice
+    monkeypatch.setattr("hannes_lab.diagnose.in_the_law", lambda search, best: ("gravity", "little"))
+    assert without_law(choice).best.names == ("glove_stiffness",)
+    monkeypatch.setattr("hannes_lab.diagnose.in_the_law", lambda search, best: ("glove_stiffness", "little"))
+    assert without_law(choice) is choice, "gravity alone does not explain it"
+    said = law_sentence("presliding_friction", "length 0.009 rad, 0.06 % of the travel", 1.6, 2.6)
+    assert "1.60 instead of 2.60" in said and "hannes add --effect presliding_friction" in said
+
+
 def test_an_error_that_rises_is_said_to_rise() -> None:
     """A fit weighs what is known of the model's own error; its error may be larger than before."""
 
@@ -486,6 +505,8 @@ def test_an_error_that_rises_is_said_to_rise() -> None:
         fall("gravity", 4.5, {"slow": 1.0, "fast": 6.0}),
     )
     assert "falls from 4.00 (nominal, fitted) to 2.00 times" in fall_sentence([*steps, better])
+    given = fall("nominal, as given", 3.0, {"slow": 2.0, "fast": 4.0})
+    assert "falls from 3.00 (nominal, as given) to 2.00" in fall_sentence([given, steps[1], better])
     assert fall_sentence(steps) == "The error on held-out closures is 4.00 times the repeatability."
     said = fall_sentence([*steps, worse])
     assert "rises from 4.00 (nominal, fitted) to 4.50 times" in said

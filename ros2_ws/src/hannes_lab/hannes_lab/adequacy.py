@@ -106,6 +106,22 @@ def disbelieved(search: Search, candidate: Candidate) -> str:
     )
 
 
+def in_the_law(search: Search, candidate: Candidate) -> tuple[str, str]:
+    """The first effect of a set that is no more than how another machine's law sets in, and how much, in words.
+
+    Only where the model has an error of its own: it has room for that.  Empty strings if there is none.
+    """
+    for effect in candidate.names if search.problem.discrepancy else ():
+        if below := search.effect(effect).law_below:
+            parameter, part = below
+            travel = max(_travel(trial) for trial in search.problem.features.trials)
+            value = candidate.fit.values[f"{effect}.{parameter}"]
+            if value < part * travel:
+                (unit,) = (p.unit for p in search.effect(effect).parameters if p.name == parameter)
+                return effect, f"{parameter} {value:.2g} {unit}, {100.0 * value / travel:.2g} % of the travel"
+    return "", ""
+
+
 def _travel(trial: Trial) -> float:
     """How far a recording's encoder goes, or, without one, its reference."""
     if "encoder_position" in trial.signals:
@@ -135,6 +151,22 @@ def distorted(search: Search, candidate: Candidate) -> str:
             return (
                 f"{effect}, of {waves:.1f} waves in all, would be of another form than is usual of it "
                 f"({name} {fit.values[name]:.2g}): it stands for something else"
+            )
+    return ""
+
+
+def led_off(base: Candidate, best: Candidate) -> str:
+    """The well-known parameter that effects take far off and that is near its nominal value without them, in words.
+
+    They replace what the model had.  Empty if there is none.
+    """
+    known = best.fit.model.names
+    for c, off in best.fit.off:
+        if off > PULLED and not c.wide and c.name in known and abs(base.fit.z_of(c.name) or 0.0) < FAR:
+            return (
+                f"{' and '.join(best.names)} would take {c.name} to {best.fit.values[c.name]:.3g} {c.unit} instead of "
+                f"{c.value(0.0):.3g}, {off:.0f} times its tolerance off, where it is not without: what is missing "
+                "has another form"
             )
     return ""
 

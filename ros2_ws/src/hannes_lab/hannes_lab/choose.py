@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from hannes_description.errors import HannesError
 
-from .adequacy import distorted, is_adequate, leads_back, shortfall
+from .adequacy import disbelieved, distorted, is_adequate, leads_back, led_off, shortfall
 from .chance import Chance, chance
 from .diagnosis import Rank
 from .features import Features
@@ -186,7 +186,14 @@ def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects
     first, last = grown.errors[0], grown.errors[-1]
     repeats = last <= AS_IT_REPEATS
     enough = repeats or (bool(grown.best.names) and halved(first, last))
-    if enough and not adequate and not repeats:
+    instead = (disbelieved(search, grown.best) or led_off(null, grown.best)) if grown.best.names else ""
+    if enough and instead:
+        adequate = enough = False
+        notes.append(
+            f"what was added lowers the error on held-out conditions to {last:.3g} times the repeatability, but "
+            f"{instead}"
+        )
+    elif enough and not adequate and not repeats:
         notes.append(
             f"the {shortfall(search, grown.best, limits)}: something smaller is left that the "
             "catalogue does not explain"

@@ -13,7 +13,7 @@ from hannes_description.model import EffectEntry, Model
 from hannes_sim.effect import catalogue, effect_source, load_effect
 from numpy.typing import NDArray
 
-from .adequacy import is_adequate, leads_back
+from .adequacy import in_the_law, is_adequate, leads_back
 from .chance import Chance, chance
 from .choose import (
     MAX_EFFECTS,
@@ -36,7 +36,7 @@ from .fit import Fit
 from .prepare import Prepared
 from .screen import usable_effects
 from .search import FAR, Candidate, Progress, Search, silent
-from .wording import bent_sentence, idle_sentence, led_back_sentence, notes, summary
+from .wording import bent_sentence, idle_sentence, law_sentence, led_back_sentence, notes, summary
 
 Array = NDArray[np.float64]
 
@@ -183,6 +183,12 @@ def _answer(prepared: Prepared, search: Search, max_effects: int, greedy: bool) 
 
     falls, holds, bent = falls_of(choice, search), choice.adequate or choice.enough, ""
     if holds and not greedy:
+        if (fewer := without_law(choice)) is not choice:
+            effect, how = in_the_law(choice.search, choice.best)
+            with_it, choice, falls = falls[-1], fewer, falls_of(fewer, search)
+            said = law_sentence(effect, how, with_it.held_out, min(fall.held_out for fall in falls))
+            named = bool(choice.best.names)
+            choice = replace(choice, **({"notes": (*choice.notes, said)} if named else {"idle": said}))
         choice, falls = without_idle(choice, falls)
         first, instead = _named_instead(choice, search)
         if instead is not choice:
@@ -257,6 +263,16 @@ def _named_instead(choice: Choice, search: Search) -> tuple[Search, Choice]:
     return other, made
 
 
+def without_law(choice: Choice) -> Choice:
+    """Without an effect that is no more than how another machine's law sets in, where the others explain all too."""
+    effect, _ = in_the_law(choice.search, choice.best)
+    if not effect:
+        return choice
+    rest = tuple(name for name in choice.best.names if name != effect)
+    (part,) = choice.search.without(choice.best, [rest])
+    return cut_to(choice, part) if is_adequate(choice.search, part, choice.limits) else choice
+
+
 def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple[Fall, ...]]:
     """Without the effects that foretell no better what took no part in the fit, where those before them explain all.
 
@@ -266,7 +282,7 @@ def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple
     """
     rig = choice.search.problem.rig
     keep = len(falls) - 2
-    while keep and not _foretells(falls[1 : keep + 2]):
+    while keep and not _foretells(falls[: keep + 2]):
         keep -= 1
     if keep == len(choice.best.names) or not (rig.foreign or choice.search.problem.discrepancy):
         return choice, falls
@@ -284,14 +300,15 @@ def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple
 def _foretells(falls: Sequence[Fall]) -> bool:
     """Whether the last of the sets has clearly less error than each before on closures or conditions left out.
 
-    On either: what a condition has of its own, like an object, cannot be foretold from the others.
+    On either: what a condition has of its own, like an object, cannot be foretold from the others.  The nominal model
+    as it was given is one of those before: its fit weighs what a model of its form may be off, and may raise the error.
     """
     known = [
         errors
         for errors in ([f.held_out for f in falls], [f.held_out_conditions for f in falls])
-        if np.isfinite(errors).all()
+        if np.isfinite(errors[1:]).all()
     ]
-    return not known or any(e[-1] ** 2 <= (1.0 - FORETOLD) * min(e[:-1]) ** 2 for e in known)
+    return not known or any(e[-1] ** 2 <= (1.0 - FORETOLD) * np.nanmin(e[:-1]) ** 2 for e in known)
 
 
 def fitted_model(model: Model, search: Search, best: Candidate, limits: Chance) -> Model:

@@ -121,21 +121,24 @@ def fall_sentence(falls: Sequence[Fall]) -> str:
 
     Where no effect was added, what it is.
 
-    A fit weighs what is known of the model's own error; the error does not.
+    A fit weighs what is known of the model's own error; the error does not: it falls from that of the nominal model as
+    it was given, where its fit made it larger.
     """
-    before, after = falls[1].held_out, falls[-1].held_out
+    first, after = min(falls[:2], key=lambda fall: fall.held_out), falls[-1].held_out
+    before = first.held_out
     if not np.isfinite([before, after]).all():
         return f"{NO_REPEATS} {_in_units(falls)}".rstrip()
     if len(falls) == WITHOUT_EFFECT:
-        return f"The error on held-out closures is {after:.2f} times the repeatability."
+        given = f" ({before:.2f} as it was given)" if before < after else ""
+        return f"The error on held-out closures is {after:.2f} times the repeatability{given}."
     verb = "falls" if after <= before else "rises"
     said = (
-        f"The error on held-out closures {verb} from {before:.2f} (nominal, fitted) to {after:.2f} times the "
+        f"The error on held-out closures {verb} from {before:.2f} ({first.added}) to {after:.2f} times the "
         "repeatability"
     )
     if after <= before:
         return f"{said}."
-    old, new = falls[1].by_condition, falls[-1].by_condition
+    old, new = first.by_condition, falls[-1].by_condition
     each = [f"'{name}' from {old[name]:.2f} to {error:.2f}" for name, error in new.items() if name in old]
     return f"{said} (conditions left out: {', '.join(each)})." if each else f"{said}."
 

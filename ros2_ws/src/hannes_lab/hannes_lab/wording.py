@@ -160,6 +160,20 @@ def idle_sentence(whole: Candidate, part: Candidate, with_all: Fall, with_part: 
     )
 
 
+def law_sentence(effect: str, how: str, with_it: float, without: float) -> str:
+    """Why an effect is not named that is no more than how another machine's law sets in."""
+    better = (
+        f" (an error of {with_it:.2f} instead of {without:.2f} on held-out closures)"
+        if np.isfinite([with_it, without]).all()
+        else ""
+    )
+    return (
+        f"{effect} would fit better{better}, but so little of it ({how}) is how the law of any other machine sets in, "
+        f"for which there is room in what a model of this form may be off: `hannes add --effect {effect}` brings the "
+        "model nearer"
+    )
+
+
 def led_back_sentence(whole: Candidate, part: Candidate) -> str:
     """Why effects are named without which what took no part in the fit is foretold as well."""
     return (

@@ -96,6 +96,8 @@ class Effect:
     states      number of own states (float64, zero at reset)
     memory      True where the effect remembers earlier closures (temperature, say), so that every closure of a
                 recording has to be simulated in turn
+    law_below   (parameter, part of the machine's travel) below which it is no more than how the law of any other
+                machine sets in, which this simulator leaves out: there it is told, but not named as missing
     looks_like  one sentence: what it looks like in the data
     told_by     one sentence: the experiment that shows it best
 
@@ -110,6 +112,7 @@ class Effect:
     known: ClassVar[tuple[EffectParameter, ...]] = ()
     states: ClassVar[int] = 0
     memory: ClassVar[bool] = False
+    law_below: ClassVar[tuple[str, float] | None] = None
     looks_like: ClassVar[str] = ""
     told_by: ClassVar[str] = ""
 

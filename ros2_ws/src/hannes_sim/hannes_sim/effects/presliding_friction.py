@@ -25,6 +25,7 @@ class PreslidingFriction(Effect):
         ),
     )
     states = 1
+    law_below = ("length", 1e-3)
     looks_like = "after a reversal the current rises over a distance, not at once; the start is soft"
     told_by = "small and slow reversals, with position and current logged fast"
 
