@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -243,3 +245,46 @@ def test_the_demo_says_what_was_noticed_in_a_bag_in_a_line(tmp_path: Path) -> No
         warnings.simplefilter("error")
         read_and_say(bag, said.append)
     assert len(said) == 1 and "Messages that repeat the one before, its stamp too, were left out" in said[0]
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_command_with_workers_that_is_stopped_leaves_none_behind(
+    sent: signal.Signals, code: int, tmp_path: Path
+) -> None:
+    """`timeout` and batch systems send SIGTERM to the command alone."""
+    words = (
+        "stiffness",
+        "dataset",
+        "--out",
+        "set",
+        "--closures",
+        "6000",
+        "--model",
+        "nominal",
+        "--jobs",
+        "2",
+    )
+    begun = subprocess.Popen(
+        [sys.executable, "-m", "hannes_bringup.cli", *words],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    until = time.monotonic() + PATIENCE
+    while not list((tmp_path / "set").glob("part_*")) and time.monotonic() < until:
+        time.sleep(0.1)
+    begun.send_signal(sent)
+    _, said = begun.communicate(timeout=PATIENCE)
+    assert begun.returncode == code and ("hannes: terminated" in said) == (sent == signal.SIGTERM), said
+    assert "Traceback" not in said and "leaked" not in said
+    until = time.monotonic() + PATIENCE
+    while time.monotonic() < until:
+        try:
+            os.killpg(begun.pid, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    os.killpg(begun.pid, signal.SIGKILL)
+    pytest.fail("workers are left")

@@ -178,12 +178,25 @@ def test_own_effect_from_a_file(tmp_path: Path, nominal: list[Rollout]) -> None:
     assert np.abs(changed[0].encoder_position - nominal[0].encoder_position).max() > 0.05
 
 
+STATES = """
+from hannes_sim.effect import Effect, EffectParameter
+class A(Effect):
+    name = "a"
+    parameters = (EffectParameter("k", "1", 0.0, 1.0, 0.5, 0.0),)
+    states = {}
+    def contribute(x, p, s, y):
+        pass
+"""
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("class A:\n    pass\n", "not a subclass"),
         ("import nothing_like_this\nclass A: pass\n", "cannot be imported"),
         ("from hannes_sim.effect import Effect\nclass A(Effect):\n    name='a'\n", "declares no parameters"),
+        (STATES.format(-3), "`states` is -3"),
+        (STATES.format(1.5), "`states` is 1.5"),
     ],
 )
 def test_broken_effect_files_give_one_clear_error(tmp_path: Path, text: str, message: str) -> None:

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
@@ -43,7 +42,9 @@ from .diagnosis import Diagnosis
 from .executor import Executor, interruptible
 from .experiments import VISIBLE, Experiment
 from .falls import NO_REPEATS, errors_in_units
-from .own_effect import check_own_effects, first_closure
+from .hand import HandRig
+from .own_effect import along_reference, check_own_effects, first_closure
+from .own_law import check_own_code
 from .prepare import Prepared, load_trials, prepare, read_trials
 from .rig import load_rig
 from .trials import SIGNALS as COMPARED
@@ -247,8 +248,7 @@ def _check_effects(prepared: Prepared, sources: Sequence[str]) -> None:
         entry = kind.entry({p.name: p.typical for p in kind.parameters}, source=effect_source(kind, source))
         prepared.rig.simulate(prepared.model.with_effect(entry), {}, trial, reference)
 
-    ticks = np.arange(0, reference.size, max(1, reference.size // 400))
-    check_own_effects(sources, simulate, (np.asarray(ticks * trial.period), reference[ticks]))
+    check_own_effects(sources, simulate, along_reference(trial, reference))
 
 
 def _command() -> str:
@@ -592,7 +592,7 @@ def hide(
     json: Json = False,
 ) -> None:
     """Make a measurement set with a hidden effect, to test the lab or to learn what an effect looks like."""
-    from .hide import DEFAULT_CONDITIONS, make_set, write_set
+    from .hide import DEFAULT_CONDITIONS, empty_trial, make_set, write_set
 
     check_writable(truth, "The truth")
     wanted: dict[str, float] = {}
@@ -609,16 +609,17 @@ def hide(
 
     for given in wanted.items():
         _check_factor(*given)
+    hand, trial = Model.load(model), empty_trial("fast")
+    check_own_code(HandRig([trial]), hand)
 
     def simulate(source: str) -> None:
         entry = strength_of(source, wanted[source])
-        make_set(Model.load(model), [entry], seed=seed, closures=1, conditions=["fast"], scatter=0.0)
+        make_set(hand, [entry], seed=seed, closures=1, conditions=["fast"], scatter=0.0)
 
-    time_ = np.arange(0.0, 2.0, 5e-3)
-    check_own_effects(wanted, simulate, (time_, 13.0 * np.maximum(0.0, np.sin(np.pi * time_))))
+    check_own_effects(wanted, simulate, along_reference(trial, trial.reference))
     entries = [strength_of(name, factor) for name, factor in wanted.items()]
     recordings, hidden = make_set(
-        Model.load(model),
+        hand,
         entries,
         seed=seed,
         closures=closures,

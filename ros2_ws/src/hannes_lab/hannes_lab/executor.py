@@ -21,6 +21,7 @@ from typing import Any, ParamSpec
 
 import typer
 from hannes_description.errors import HannesError
+from hannes_description.stopping import Terminated, terminable
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
@@ -193,36 +194,13 @@ def own(rig: Any) -> Any:
     return copy.deepcopy(rig)
 
 
-class Terminated(KeyboardInterrupt):
-    """SIGTERM came: what is being done ends as on Ctrl-C."""
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM raises Terminated in this block, once; a second one is ignored while things end."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def end(*_: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        raise Terminated
-
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        if signal.getsignal(signal.SIGTERM) is end:
-            signal.signal(signal.SIGTERM, before)
-
-
 def interruptible(command: Callable[P, None]) -> Callable[P, None]:
     """A command that Ctrl-C ends with one line and exit code 130, and SIGTERM with one line and exit code 143."""
 
     @functools.wraps(command)
     def run(*words: P.args, **options: P.kwargs) -> None:
         try:
-            with _terminable():
+            with terminable():
                 command(*words, **options)
         except KeyboardInterrupt as why:
             kept = not options.get("no_cache")

@@ -28,6 +28,7 @@ from hannes_sim.rollout import Rollout, rollout
 from numpy.typing import NDArray
 
 from .hand import make_controller
+from .trials import Closure, Trial
 
 Array = NDArray[np.float64]
 
@@ -65,6 +66,15 @@ DEFAULT_CONDITIONS = ("slow", "fast", "grasp")
 
 REST = 0.5
 """s of rest before the first closure."""
+
+
+def empty_trial(condition: str, period: float = 1e-3) -> Trial:
+    """A closure of which nothing was recorded: what a model's own code is tried on."""
+    spec = CONDITIONS[condition]
+    reference = spec.reference(period, 1.0 / period)
+    return Trial(
+        condition, period, reference, {}, (Closure(0.0, spec.period, condition),), {"object": spec.grasp}
+    )
 
 
 @dataclass(frozen=True)

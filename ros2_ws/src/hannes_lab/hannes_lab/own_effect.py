@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 from hannes_description.errors import HannesError
 from hannes_sim.effect import ContributeFailed, EffectType, compile_effect, load_effect
-from hannes_sim.ports import DT, N_INPUTS, N_OUTPUTS, QL, VL, Q, T, V
+from hannes_sim.ports import DT, N_INPUTS, N_OUTPUTS, QL, RESISTANCE, SUPPLY, VL, Q, T, V
 from numpy.typing import NDArray
 
 from .trials import Trial
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 TIME_LIMIT = 60.0
 """s; import and compilation take a few, a closure milliseconds (on the MuJoCo plant a few seconds)."""
 
-Simulate = Callable[[str], None]
+Simulate = Callable[[str], object]
 
 
 def check_own_effects(
@@ -45,6 +45,12 @@ def first_closure(trials: Sequence[Trial]) -> tuple[Trial, Array]:
     """The trial whose first closure ends soonest, and its reference up to there."""
     trial = min(trials, key=lambda t: t.closures[0].stop)
     return trial, trial.reference[: round(trial.closures[0].stop / trial.period)]
+
+
+def along_reference(trial: Trial, reference: Array) -> tuple[Array, Array]:
+    """Time (n,) s and position (n,) of a closure that follows its reference."""
+    ticks = np.arange(0, reference.size, max(1, reference.size // 400))
+    return np.asarray(ticks * trial.period), reference[ticks]
 
 
 def _check(source: str, simulate: Simulate, motion: tuple[Array, Array], limit: float) -> None:
@@ -111,7 +117,7 @@ def _try(source: str, simulate: Simulate, motion: tuple[Array, Array]) -> str:
 def _acts_switched_off(kind: EffectType, x: Array) -> bool:
     off = np.array([p.typical if p.vanishing is None else p.vanishing for p in kind.figures()])
     y = np.zeros(N_OUTPUTS)
-    kind.contribute(x, off, np.zeros(max(kind.states, 1)), y)
+    kind.contribute(x, off, np.zeros(kind.states), y)
     return bool(np.any(np.abs(y) > 1e-12))
 
 
@@ -120,22 +126,34 @@ def _without_number(kind: EffectType, source: str, time: Array, position: Array)
 
     Compiled, a NaN may vanish in a limiter and the effect would silently do nothing.
     """
-    x, s, y = np.zeros(N_INPUTS), np.zeros(max(kind.states, 1)), np.zeros(N_OUTPUTS)
+    x, s, y = np.zeros(N_INPUTS), np.zeros(kind.states), np.zeros(N_OUTPUTS)
+    x[RESISTANCE] = x[SUPPLY] = 1.0  # which no machine has at 0
     p = np.array([parameter.typical for parameter in kind.figures()])
     velocity = np.gradient(position, time)
     x[DT] = float(np.median(np.diff(time)))
     for t, q, v in zip(time, position, velocity, strict=True):
         x[T], x[Q], x[QL], x[V], x[VL] = t, q, q, v, v
         y[:] = 0.0
+        given, twin, more = (x.copy(), p.copy()), s.copy(), np.ones(N_OUTPUTS)
         try:
             kind.contribute(x, p, s, y)
+            kind.contribute(x, p, twin, more)
             wrong = "" if np.isfinite(y).all() and np.isfinite(s).all() else "NaN or infinity"
-        except (ArithmeticError, ValueError, IndexError) as error:
+        except IndexError as error:
+            wrong = f"no number ({error}; s has as many as its class says: `states = 1`)"
+        except (ArithmeticError, ValueError) as error:
             wrong = f"no number ({error})"
         if not wrong and kind.parameters and _acts_switched_off(kind, x):
             return (
                 f"'{source}': with its parameters at their vanishing values it still acts, at position {q:.4g}, "
                 f"velocity {v:.4g}. An effect that is switched off must add nothing."
+            )
+        if not (np.array_equal(given[0], x) and np.array_equal(given[1], p)):
+            return f"'{source}': contribute(x, p, s, y) changes x or p; it may only read them."
+        if not wrong and not np.allclose(more - 1.0, y, rtol=1e-6, atol=1e-9):
+            return (
+                f"'{source}': contribute(x, p, s, y) sets an output at position {q:.4g}, velocity {v:.4g}; it must add "
+                "to y (`y[TORQUE] += ...`), where other effects add too."
             )
         if wrong:
             return (

@@ -31,7 +31,7 @@ from numba import njit
 from numba.core.ccallback import CFunc
 from numpy.typing import NDArray
 
-from .own_effect import TIME_LIMIT, apart, first_closure
+from .own_effect import TIME_LIMIT, along_reference, apart, check_own_effects, first_closure
 from .rig import PlantRig
 from .trials import Trial
 
@@ -47,6 +47,16 @@ _GIVEN = (C_REFERENCE, C_POSITION, C_VELOCITY, C_CURRENT)
 _FILL = 1.0
 _OTHERS = (0.0, math.nan, -1e6)
 """What lies beside the arrays: another voltage with one of these tells that it was read."""
+
+
+def check_own_code(rig: PlantRig, model: Model) -> None:
+    """Try the control law and the effects that a model file brings, before anything is simulated with them here."""
+    check_own_law(rig, model)
+    own = [effect.source for effect in model.effects if effect.source and ":" in effect.source]
+    trial, reference = first_closure(rig.trials)
+    check_own_effects(
+        own, lambda _: rig.simulate(model, {}, trial, reference), along_reference(trial, reference)
+    )
 
 
 def check_own_law(rig: PlantRig, model: Model, *, limit: float = TIME_LIMIT) -> None:

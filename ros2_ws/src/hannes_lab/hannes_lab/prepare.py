@@ -24,7 +24,7 @@ from .grasp import with_seen_objects
 from .hand import HandRig
 from .join import Loaded, join_repeats, join_trials
 from .lags import with_one_clock
-from .own_law import check_own_law
+from .own_law import check_own_code
 from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig, check_parameters
 from .settle import settle
@@ -181,14 +181,17 @@ def prepare(
     if rig is not None:
         trials = join_trials(check_trials(trials, (rig if isinstance(rig, type) else type(rig)).__name__))
     trials = [without_outliers(trial) for trial in trials]
-    if rig is None:
-        trials = with_seen_objects(with_one_clock(trials, model), model)
+    hand = rig is None
     rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
     check_parameters(rig, model)
+    if hand and isinstance(rig, PlantRig):
+        check_own_code(rig, model)
+        trials = with_seen_objects(with_one_clock(trials, model), model)
+        rig = HandRig(trials)
     strange = not isinstance(rig, HandRig)
     told = check_rig(rig, model) if strange else []
-    if isinstance(rig, PlantRig):
-        check_own_law(rig, model)
+    if not hand and isinstance(rig, PlantRig):
+        check_own_code(rig, model)
     known = dict.fromkeys((*SIGNALS, "motor_effort", *(s for t in trials for s in t.signals)))
     present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
     unknown = [s for s in signals or () if s not in present]

@@ -25,6 +25,7 @@ from numba import cfunc
 from numpy.typing import NDArray
 
 from .native import EFFECT_SIGNATURE, needs_python
+from .plant import PlantDiverged
 from .ports import N_INPUTS, N_OUTPUTS
 
 NEEDS_PYTHON = "calls print, or something else that needs Python, which compiled code has not"
@@ -176,6 +177,10 @@ def check_effect(effect: EffectType, where: str) -> EffectType:
         raise HannesError(
             f"{where}: effect '{effect.name}': each parameter needs a name of its own, and what is `known` no "
             "`vanishing` value."
+        )
+    if not isinstance(effect.states, int) or isinstance(effect.states, bool) or effect.states < 0:
+        raise HannesError(
+            f"{where}: effect '{effect.name}': `states` is {effect.states!r}; it must be how many it has."
         )
     if "contribute" not in effect.__dict__ and all(
         "contribute" not in b.__dict__ for b in effect.__mro__[:-2]
@@ -359,11 +364,20 @@ class BoundEffects:
 
     def failed(self, said: str, time: float) -> ContributeFailed:
         """The error of an effect that raised an exception at a time [s]."""
+        return ContributeFailed(f"{self._blamed} failed at t = {time:.4g} s: {said}.")
+
+    def undefined(self, time: float) -> PlantDiverged:
+        """The error of an effect that gave no number until a time [s]."""
+        return PlantDiverged(
+            f"{self._blamed} gave NaN or infinity before t = {time:.4g} s; it must give finite numbers wherever the "
+            "machine goes."
+        )
+
+    @property
+    def _blamed(self) -> str:
         own = [effect.name for effect in self.effects if effect.name not in catalogue()]
         which = "' or '".join(own or [effect.name for effect in self.effects])
-        return ContributeFailed(
-            f"Effect '{which}': contribute(x, p, s, y) failed at t = {time:.4g} s: {said}."
-        )
+        return f"Effect '{which}': contribute(x, p, s, y)"
 
     @classmethod
     def of(cls, entries: tuple[EffectEntry, ...]) -> BoundEffects:

@@ -35,6 +35,7 @@ from .ports import (
     P_RESOLUTION,
     P_SUPPLY,
     P_ZERO,
+    QL,
     R_CURRENT,
     R_EFFORT,
     R_POSITION,
@@ -49,20 +50,28 @@ from .ports import (
     S_POSITION_READ,
     S_RATE,
     S_TIME_STEPS,
+    S_UNDEFINED,
     SENSE_CURRENT,
     SENSE_CURRENT_GAIN,
     SENSE_POSITION,
     SUPPLY,
     VOLTAGE,
     VOLTAGE_DROP,
+    Q,
     T,
     V,
 )  # fmt: skip
 
+FASTEST = 1e4
+"""rad/s; a machine that is faster has diverged, whatever its effects give."""
+
 
 @njit(cache=True)
 def evaluate_effects(handle):  # type: ignore[no-untyped-def]
-    """Sum the contributions of all active effects into the outputs; the inputs must be filled before."""
+    """Sum the contributions of all active effects into the outputs; the inputs must be filled before.
+
+    One that is not finite where the machine still is, is kept in mind: a limiter may take it for a number.
+    """
     x, y = handle[H_INPUTS], handle[H_OUTPUTS]
     out = pointer_f8(y)
     for k in range(N_OUTPUTS):
@@ -70,6 +79,16 @@ def evaluate_effects(handle):  # type: ignore[no-untyped-def]
     table = pointer_i8(handle[H_EFFECTS])
     for k in range(table[0]):
         call_effect(table[1 + 3 * k], x, table[2 + 3 * k], table[3 + 3 * k], y)
+    if table[0] > 0:
+        a = b = c = 0.0  # three sums that wait for each other less than one does
+        for k in range(0, N_OUTPUTS, 3):
+            a += out[k]
+            b += out[k + 1]
+            c += out[k + 2]
+        if not math.isfinite(a + b + c):
+            given = pointer_f8(x)
+            if math.isfinite(given[Q] + given[QL]) and abs(given[V]) < FASTEST:
+                pointer_f8(handle[H_STATE])[S_UNDEFINED] = 1.0
 
 
 @njit(cache=True)

@@ -98,8 +98,10 @@ from .ports import (
     S_CONTACT,
     S_LOAD,
     S_TIME_STEPS,
+    S_UNDEFINED,
     SLACK,
     TORQUE,
+    UNDEFINED,
     VL,
 )  # fmt: skip
 from .raised import watched
@@ -240,7 +242,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
         for j in range(_N_WARNINGS):
             if warnings[j] >> _WARNING_SHIFT:
                 bad = -1.0 - j
-    out[R_WARNING] = bad
+    out[R_WARNING] = UNDEFINED if s[S_UNDEFINED] > 0.0 else bad
 
 
 _compiled = cfunc(ADVANCE_SIGNATURE, cache=True)(_advance)
@@ -575,6 +577,8 @@ class MujocoPlant:
         expected = steps * self.dt
         if code == 0.0 and abs(self.data.time - expected) <= 1e-6 * max(1.0, expected):
             return
+        if code == UNDEFINED:
+            raise self.effects.undefined(expected)
         joint = self._suspect(code)
         reason = "its time does not match the steps taken"
         if code > 0.0:

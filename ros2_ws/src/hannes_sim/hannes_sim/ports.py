@@ -52,10 +52,12 @@ R_FORCE = 5  # N, total fingertip force on the object
 R_Q = 6  # rad, true motor side position
 R_QL = 7  # rad, true load side position
 R_LOAD = 8  # N.m, true transmitted torque
-R_WARNING = 9  # 0 fine, otherwise the plant diverged at this step count
+R_WARNING = 9  # 0 fine, UNDEFINED, or another number of the plant's where it diverged
 R_JOINTS = 10  # rad, 13 finger joints, then 13 velocities in rad/s
 N_JOINTS = 13
 N_READING = R_JOINTS + 2 * N_JOINTS
+
+UNDEFINED = 1e6  # in R_WARNING: an effect gave NaN or infinity
 
 # Handle of a plant: int64 addresses of its buffers
 H_PARAMETERS = 0  # float64
@@ -96,6 +98,7 @@ S_RATE = (
 )
 S_DECAY = 7  # exp(-rate)
 S_MEAN = 8  # (1 - exp(-rate)) / rate
-N_STATE_COMMON = 9
+S_UNDEFINED = 9  # 1 once an effect gave NaN or infinity
+N_STATE_COMMON = 10
 
 DELAY_RING = 512  # commands kept; the longest delay is DELAY_RING x dt

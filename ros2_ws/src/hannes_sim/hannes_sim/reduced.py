@@ -78,9 +78,11 @@ from .ports import (
     S_CONTACT,
     S_LOAD,
     S_TIME_STEPS,
+    S_UNDEFINED,
     SENSE_POSITION,
     SLACK,
     TORQUE,
+    UNDEFINED,
     VL,
 )  # fmt: skip
 from .raised import watched
@@ -171,6 +173,8 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
     out[R_FORCE] = contact / p[_TIP] if p[_TIP] > 0.0 else 0.0
     out[R_Q], out[R_QL], out[R_LOAD] = q, ql, load
     out[R_WARNING] = 0.0 if math.isfinite(q) and math.isfinite(ql) and abs(v) < 1e6 else 1.0
+    if s[S_UNDEFINED] > 0.0:
+        out[R_WARNING] = UNDEFINED
 
 
 _compiled = cfunc(ADVANCE_SIGNATURE, cache=True)(_advance)
@@ -340,6 +344,8 @@ class ReducedPlant:
         self._joints()
 
     def check(self) -> None:
+        if self.reading[R_WARNING] == UNDEFINED:
+            raise self.effects.undefined(self.states[S_TIME_STEPS] * self.dt)
         if self.reading[R_WARNING] != 0.0:
             which = "motor pulley" if not math.isfinite(self.reading[R_Q]) else "hand coordinate"
             raise PlantDiverged(

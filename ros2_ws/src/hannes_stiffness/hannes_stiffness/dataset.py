@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -675,9 +675,18 @@ def _make_part(
 def _run(work: Sequence[_Work], jobs: int) -> Iterable[_Made]:
     if jobs == 1:
         return (_make_part(*item) for item in work)
-    from joblib import Parallel, delayed
+    return _in_workers(work, jobs)
 
-    results: Iterable[_Made] = Parallel(n_jobs=jobs, return_as="generator")(
-        delayed(_make_part)(*item) for item in work
-    )
-    return results
+
+def _in_workers(work: Sequence[_Work], jobs: int) -> Iterator[_Made]:
+    """What worker processes make; where this is left early (Ctrl-C, SIGTERM), they are ended at once."""
+    from joblib import Parallel, delayed
+    from joblib.externals.loky import get_reusable_executor
+
+    whole = False
+    try:
+        yield from Parallel(n_jobs=jobs, return_as="generator")(delayed(_make_part)(*item) for item in work)
+        whole = True
+    finally:
+        if not whole:
+            get_reusable_executor().shutdown(wait=True, kill_workers=True)

@@ -11,12 +11,14 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import typer
 from hannes_description.errors import HannesError
+from hannes_description.stopping import terminable
 
 from .. import __version__
 
@@ -123,22 +125,29 @@ def load(command: Command) -> Any:
     return typer.main.get_command(target)
 
 
+_INTERRUPTED, _TERMINATED = 130, 143
+"""Exit codes after SIGINT and SIGTERM."""
+
+
 def main() -> int:
     """Entry point of `hannes`."""
     code: int | str | None = 0
     _open_what_is_closed()
     try:
-        build_app()()
+        with terminable() as came:
+            build_app()()
     except HannesError as error:
         print(f"hannes: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        return 130
+        return _stopped(came)
     except SystemExit as end:
         # typer and rich say this where a pipe broke; whether one did stands in the context
         if isinstance(end.__context__, BrokenPipeError):
             return _nobody_reads()
         code = end.code
+        if code == _INTERRUPTED:  # typer's, whatever stopped it
+            return _stopped(came)
     except BrokenPipeError:
         return _nobody_reads()
     except OSError:
@@ -152,6 +161,13 @@ def main() -> int:
     if code is None or isinstance(code, int):
         return code or 0
     raise SystemExit(code)
+
+
+def _stopped(terminated: threading.Event) -> int:
+    if not terminated.is_set():
+        return _INTERRUPTED
+    print("\nhannes: terminated", file=sys.stderr)
+    return _TERMINATED
 
 
 def _open_what_is_closed() -> None:
