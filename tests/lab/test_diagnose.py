@@ -257,7 +257,10 @@ def test_effects_that_bend_the_model_and_leave_most_of_the_error_are_no_answer(g
     begin = (fall(9.0), fall(4.5))
     little, enough = (*begin, fall(3.5)), (*begin, fall(2.7))
     said = bent_sentence(Choice(about, bent, limits, True, ()), little)
-    assert "glove_stiffness would explain it only with friction.viscous" in said and "more than half" in said
+    assert (
+        "glove_stiffness would bring the misfit within chance only with friction.viscous" in said
+        and "more than half" in said
+    )
     for choice, falls in (
         (Choice(about, bent, limits, True, ()), enough),
         (Choice(about, bent, limits, True, ()), (*begin, fall(3.5, 2.0))),

@@ -38,7 +38,7 @@ from .compare import Comparison, MetricRow
 from .compare import compare as compare_model
 from .diagnose import diagnose as diagnose_model
 from .diagnose import effect_sources
-from .diagnosis import Diagnosis
+from .diagnosis import Diagnosis, has_excess
 from .executor import Executor, interruptible
 from .experiments import VISIBLE, Experiment
 from .falls import NO_REPEATS, errors_in_units
@@ -426,7 +426,9 @@ def _show_diagnosis(found: Diagnosis, machine: str) -> None:
             )
         console.print(f"  {effect.why}")
     _show_falls(console, found, machine)
-    if found.ranking:
+    if found.ranking and not has_excess(found.costs, bool(found.effects)):
+        console.print("\nThere is no excess misfit that effects could explain: chance explains all of it.")
+    elif found.ranking:
         console.print("\nRanking (part of the excess misfit that each effect explains alone):")
         for rank in found.ranking[:8]:
             console.print(f"  {100 * rank.explained:5.1f} %  {' + '.join(rank.names)}")

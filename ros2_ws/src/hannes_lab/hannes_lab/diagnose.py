@@ -36,7 +36,15 @@ from .fit import Fit
 from .prepare import Prepared
 from .screen import usable_effects
 from .search import FAR, Candidate, Progress, Search, silent
-from .wording import bent_sentence, idle_sentence, law_sentence, led_back_sentence, notes, summary
+from .wording import (
+    bent_sentence,
+    idle_sentence,
+    law_sentence,
+    led_back_sentence,
+    notes,
+    summary,
+    worse_fitted,
+)
 
 Array = NDArray[np.float64]
 
@@ -146,6 +154,7 @@ def diagnose(
             *choice.notes,
             *left_out,
             *notes(search, best, verdict, experiments, greedy),
+            *worse_fitted(falls),
         ),
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
@@ -384,7 +393,7 @@ def _found(
         if s.rmse < SEEN * b.rmse
         else "No signal of any condition is missed by much less with it than without."
     )
-    why = f"{missed} What it looks like: {kind.looks_like}."
+    why = f"{missed} What it looks like: {kind.looks_like}." if kind.looks_like else missed
     return FoundEffect(name, kind.title, effect_source(kind, search.sources[name]), parameters, why)
 
 

@@ -96,6 +96,12 @@ class Rank:
         return {"names": list(self.names), "cost": self.cost, "explained": self.explained}
 
 
+def has_excess(costs: Mapping[str, Any], named: bool) -> bool:
+    """Whether there is a misfit to share out among effects: none below what chance reaches, unless one was named."""
+    critical, nominal = costs.get("critical"), costs.get("nominal_fitted")
+    return named or critical is None or nominal is None or nominal > critical
+
+
 def both_models(given: Model, fitted: Model) -> dict[str, Any]:
     """What an answer says of the model that was given and of the fitted one, with its effects, for a report."""
     return {

@@ -223,8 +223,8 @@ class _View:
     def _diagnose(self) -> None:
         chosen = list(self.effects.value)
         only = bool(self.only.value and chosen)
-        # the catalogue takes part anyway
-        self.work.start("diagnose", effects=[e for e in chosen if only or ":" in e], only=only)
+        # the catalogue takes part anyway; what is no name of it is refused by name
+        self.work.start("diagnose", effects=[e for e in chosen if only or e not in self._titles], only=only)
 
     def _add(self) -> None:
         self.work.start("add", effects=list(self.effects.value))

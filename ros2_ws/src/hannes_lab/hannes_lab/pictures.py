@@ -160,7 +160,7 @@ def _panels(fall: Part | None, maps: Sequence[Part], ranks: Part | None) -> list
         rows = sum(len(g) for g in m["groups"].values()) + 0.35 * len(m["groups"])
         labels = 0.0 if k else _inches([_row_name(c, s) for c, g in m["groups"].items() for s in g])
         name = f"{m['kind'].capitalize()}: " if len(maps) > 1 else ""
-        found = f"{m['fails']} of {m['all']} fail" if m["judged"] else "error, × repeatability"
+        found = f"{m['fails']} of {m['judged']} fail" if m["judged"] else "error, × repeatability"
         out.append(
             Panel(
                 f"{name}{found}",

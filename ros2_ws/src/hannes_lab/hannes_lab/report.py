@@ -24,6 +24,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from . import report_text as text
+from .diagnosis import has_excess
 from .experiments import VISIBLE
 from .falls import errors_in_units
 from .report_next import SHOWN, how_sure, next_step, runner_up
@@ -324,7 +325,7 @@ def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None
     cells = _list(comparison, "cells")
     judged = [c for c in cells if text.known(c.get("p_value")) is not None]
     if judged:
-        now_cells = _list(after, "cells") or cells
+        now_cells = [c for c in _list(after, "cells") or cells if text.known(c.get("p_value")) is not None]
         out.append(
             {
                 "value": f"{sum(bool(c.get('fails')) for c in now_cells)} of {len(now_cells)}",
@@ -503,8 +504,7 @@ def failure_maps(comparison: Part | None, after: Part | None) -> list[dict[str, 
                 "groups": groups,
                 "cells": source,
                 "fails": sum(bool(c.get("fails")) for c in source),
-                "all": len(source),
-                "judged": any(text.known(c.get("p_value")) is not None for c in source),
+                "judged": sum(text.known(c.get("p_value")) is not None for c in source),
                 "scaled": any(text.known(c.get("ratio")) is not None for c in source),
             }
         )
@@ -613,8 +613,7 @@ def ranking(diagnosis: Part | None) -> dict[str, Any] | None:
         text.known((diagnosis.get("costs") or {}).get(k)) for k in ("critical", "nominal_fitted")
     )
     found = {str(e.get("name")) for e in _list(diagnosis, "effects")}
-    # Below the critical value there is no misfit to share out, unless an effect gained more than chance does.
-    excess = critical is None or nominal is None or nominal > critical or bool(found)
+    excess = has_excess({"critical": critical, "nominal_fitted": nominal}, bool(found))
     out = []
     for row in rows:
         cost, share = text.known(row.get("cost")), text.known(row.get("explained")) if excess else None

@@ -123,8 +123,22 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
     if not known or any(halved(a, b) for a, b in known):
         return ""
     return (
-        f"{' and '.join(best.names)} would explain it only with {_far_values(best)}, far outside the tolerance, and "
-        "still leave more than half of the error on held-out closures"
+        f"{' and '.join(best.names)} would bring the misfit within chance only with {_far_values(best)}, far outside "
+        "the tolerance, and still leave more than half of the error on held-out closures"
+    )
+
+
+def worse_fitted(falls: Sequence[Fall]) -> tuple[str, ...]:
+    """A sentence where the fit of the nominal model has a larger error than the nominal model itself."""
+    given, fitted = falls[0].held_out, falls[1].held_out
+    return (
+        (
+            f"the nominal model is further off as fitted ({fitted:.2f}) than as given ({given:.2f} times the "
+            "repeatability): a fit weighs each sample by how well it is known and how far a model of this form may be "
+            "off, and pays for tolerances; these errors do not",
+        )
+        if fitted > given
+        else ()
     )
 
 
