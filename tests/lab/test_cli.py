@@ -135,6 +135,8 @@ def test_hide_keeps_the_truth_away_from_the_bags(
         (("compare", "BAGS", "--object", "slow"), "CONDITION="),
         (("compare", "BAGS", "--object", "quick=soft"), "unknown conditions"),
         (("compare", "EMPTY"), "holds no bag"),
+        (("validate", "--row", "R01", "--model-out", "x.yaml"), "only --calibrate writes a model file"),
+        (("validate", "--calibrate", "--motor", "none"), "--motor none: valid are"),
         (("hide", "OUT", "--truth", "T", "--effect", "wire_slack=much"), "wire_slack=much"),
         (("hide", "OUT", "--truth", "T", "--condition", "quick"), "slow"),
         # files that cannot be written are named before anything is read

@@ -130,6 +130,8 @@ def test_sets_train_together_and_their_objects_and_hands_stay_apart(small):
     other = make_dataset(draw_scenes(9, 2, hands=3), MODEL, seed=2)
     both = merge([small, other])
     assert merge([small]) is small
+    with pytest.raises(HannesError, match="more than once"):
+        merge([small, small])
     assert len(both.closures) == len(small.closures) + 9
     a, b = (d.training_data(FeatureSpec()) for d in (small, both))
     np.testing.assert_array_equal(b.values[: len(a.values)], a.values)

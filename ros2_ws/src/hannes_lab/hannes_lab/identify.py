@@ -319,9 +319,13 @@ def warnings_of(parameters: Sequence[Identified], free_count: int, data_count: i
     for p in parameters:
         if p.narrowing > UNIDENTIFIED:
             by_held = p.held_share > 0.5
+            width = (
+                f"{100 * p.narrowing:.0f} % of the prior's"
+                if p.narrowing < 1.0
+                else "no narrower than the prior's"
+            )
             out.append(
-                f"{p.name} is not identified by these data: its interval is {100 * p.narrowing:.0f} % of the "
-                "prior's"
+                f"{p.name} is not identified by these data: its interval is {width}"
                 + (
                     f", most of it from the tolerance of {p.held}, which is held: measure {p.held}, or free it."
                     if by_held

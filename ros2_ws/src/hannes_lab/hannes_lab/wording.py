@@ -42,6 +42,9 @@ UNUSUAL = 1.5
 NAMED = 4
 """Effects that a sentence names; of more, it says how many."""
 
+NOUGHT = 1e-9
+"""What is less is said as 0: no parameter of a machine is that small in SI."""
+
 MANY_FAILURES = 0.05
 """Part of the simulations that did not stay finite from which on their parameters are worth a look."""
 
@@ -242,8 +245,11 @@ def _far_above(best: Candidate) -> str:
 
 
 def _said_far(best: Candidate, far: Sequence[Coordinate]) -> str:
-    values = best.fit.values
-    return ", ".join(f"{c.name} {values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g}" for c in far)
+    values, off = best.fit.values, {c.name: z for c, z in best.fit.off}
+    return ", ".join(
+        f"{c.name} {values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g} ({off[c.name]:.0f} tolerances)"
+        for c in far
+    )
 
 
 def failure_notes(problem: Problem) -> list[str]:
@@ -322,7 +328,8 @@ def _undescribed(best: Candidate) -> list[str]:
     for c, value in zip(best.fit.coordinates, best.fit.values.values(), strict=True):
         name, _, place = c.name.partition("@")
         if c.wide:
-            fitted.setdefault(place, []).append(f"{name} {value:.3g} {c.unit}".rstrip())
+            shown = value if abs(value) > NOUGHT else 0.0
+            fitted.setdefault(place, []).append(f"{name} {shown:.3g} {c.unit}".rstrip())
     whole = fitted.pop("")
     return [f"the recordings do not tell these, so they were fitted: {', '.join(whole)}"] * bool(whole) + [
         f"{place}: fitted too, as the recording does not tell: {', '.join(own)}"

@@ -264,7 +264,7 @@ def _listed(counts: dict[str, Any]) -> str:
 
 
 def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100.0 * value:.2f} %"
+    return "-" if value is None else f"{100.0 * value:.2f}\u00a0%"  # no line ends before the sign
 
 
 def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

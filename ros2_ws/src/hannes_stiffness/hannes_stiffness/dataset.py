@@ -469,6 +469,11 @@ def merge(sets: Sequence[Dataset]) -> Dataset:
         raise HannesError("There is no data set to train on.")
     if len(sets) == 1:
         return sets[0]
+    whose = [json.dumps(one.manifest, sort_keys=True) for one in sets]
+    if len(set(whose)) < len(whose):
+        raise HannesError(
+            "A data set is given more than once: its closures would be on both sides of every split."
+        )
     most = 1 + max(c.scene.hand for one in sets for c in one.closures)
     closures = tuple(
         replace(
@@ -492,7 +497,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise HannesError(
-            f"'{folder}' is not a stiffness data set ({error}). Make one with `hannes stiffness dataset`."
+            f"'{folder}' is not a stiffness data set ({error}); give the folder of one, or a new one to make it in."
         ) from error
     if not isinstance(manifest, dict) or manifest.get("schema") != SCHEMA:
         raise HannesError(f"'{folder}' is not a stiffness data set of this version ({SCHEMA}).")

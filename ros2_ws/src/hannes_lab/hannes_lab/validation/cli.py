@@ -16,6 +16,7 @@ from hannes_description.parameters import data_path
 
 from ..cache import default_folder
 from ..cli import _Progress
+from ..cli_files import check_model_file
 from ..executor import interruptible
 from . import (
     columns,
@@ -159,6 +160,14 @@ def validate(
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
 ) -> None:
     """Hold the plant against the thesis, row by row; writes docs/validation.md and its pictures."""
+    if model_out is not None:
+        if not calibrate:
+            raise HannesError(
+                f"--model-out {model_out}: only --calibrate writes a model file; say --calibrate too."
+            )
+        check_model_file(model_out)
+    if calibrate and motor not in fitting.MOTORS:
+        raise HannesError(f"--motor {motor}: valid are {', '.join(fitting.MOTORS)}.")
     begin = time.monotonic()
     with _Progress(quiet=json) as progress:
         if laws:
