@@ -329,6 +329,7 @@ GIVEN = {
         ),
         ({"body": "return s[-1]"}, "reads s[-1]: index -1 is out of bounds"),
         ({"body": "s[2] += 2.0"}, "writes s[2]: index 2 is out of bounds, the length of its `states` is 1"),
+        ({"body": "if s[2] == 0.0: s[2] = 1.0"}, "reads s[2]: index 2 is out of bounds"),
         ({"body": "x[6] = 2.0"}, "writes x[6]: index 6 is out of bounds, the length of x is 6"),
         ({"body": "return 1.0 / p[0]"}, "The control law failed at t = 0 s: ZeroDivisionError"),
         ({"body": "if x[5] > 0.3: raise ValueError('far')"}, "failed at t = 0.301 s: ValueError: far ("),

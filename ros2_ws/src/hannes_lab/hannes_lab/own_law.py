@@ -109,10 +109,11 @@ class _Between:
         self.whole = [np.pad(a.ravel(), BESIDE, constant_values=_FILL) for a in given]
         self.inputs, self.parameters, self.states = (a[BESIDE:-BESIDE] for a in self.whole)
 
-    def changed(self) -> tuple[int, int] | None:
-        """Array and index of the first watched number that is another now."""
+    def changed(self, value: float = _FILL) -> tuple[int, int] | None:
+        """Array and index of the first watched number that is another than `value` now."""
         for array, whole in enumerate(self.whole):
-            at = np.flatnonzero(_beside(whole.size) & (whole != _FILL))
+            same = np.isnan(whole) if math.isnan(value) else whole == value
+            at = np.flatnonzero(_beside(whole.size) & ~same)
             if at.size:
                 return array, int(at[0]) - BESIDE
         return None
@@ -141,7 +142,10 @@ def _outside(law: _Between, run: Rollout, who: str) -> str:
 def _read(law: _Between, run: Rollout, usual: Array) -> tuple[int, int] | None:
     """Array and index of the first watched number on which the voltages depend."""
     for other in _OTHERS:
-        if not _same(usual, _along(law, run, other)):
+        voltages = _along(law, run, other)
+        if written := law.changed(other):  # where it is what it reads there that makes it write
+            return written
+        if not _same(usual, voltages):
             places = [
                 (a, k) for a, whole in enumerate(law.whole) for k in np.flatnonzero(_beside(whole.size))
             ]
