@@ -1,6 +1,7 @@
 """What every plant promises: units, determinism, rest, limits, sign of the motion; run on each plant and variant."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hannes_description.model import Model
 from hannes_sim.effect import load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.objects import RIGID_DYNAMOMETER, SOFT_BALL
-from hannes_sim.plant import Plant
+from hannes_sim.plant import Plant, Reading
 from hannes_sim.rollout import VoltagePlayback, rollout
 
 MODELS: dict[str, Callable[[], Model]] = {
@@ -138,3 +139,27 @@ def test_bad_step_and_reference_are_refused(model: Model) -> None:
     plant, law = make_plant(model), DoublePID.of_model(model.parameters)
     with pytest.raises(HannesError, match="not finite at sample 3"):
         rollout(plant, law, np.array([0.0, 0.0, 0.0, np.nan]))
+
+
+def test_a_plant_of_ones_own_is_told_what_it_lacks(tmp_path: Path) -> None:
+    """A subclass of a shipped plant has all that the protocol lists."""
+    (tmp_path / "mine.py").write_text(
+        "from hannes_sim.reduced import ReducedPlant\n"
+        "class Mine(ReducedPlant):\n    pass\n"
+        "class Bare:\n    def __init__(self, model, grasp, *, dt):\n        self.dt, self.names = dt, ()\n"
+        "class Wrong:\n    def __init__(self, model):\n        pass\n",
+        encoding="utf-8",
+    )
+    model = Model.load()
+    mine = make_plant(model.with_plant(f"{tmp_path / 'mine.py'}:Mine"))
+    mine.advance(1.0, 4)
+    assert mine.read().position == advanced(make_plant(model)).position
+    with pytest.raises(HannesError, match=r"has no address, handle, reading, reset, .*a subclass of"):
+        make_plant(model.with_plant(f"{tmp_path / 'mine.py'}:Bare"))
+    with pytest.raises(HannesError, match=r"Wrong\(model, grasp, dt=...\) in .* failed: TypeError"):
+        make_plant(model.with_plant(f"{tmp_path / 'mine.py'}:Wrong"))
+
+
+def advanced(plant: Plant) -> Reading:
+    plant.advance(1.0, 4)
+    return plant.read()

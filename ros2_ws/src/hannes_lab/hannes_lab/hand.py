@@ -413,7 +413,8 @@ class HandRig(PlantRig):
     def plant(self, model: Model, trial: Trial) -> Plant:
         """The plant with the trial's object, encoder quantiser off."""
         plant = make_plant(model, object_of(trial), dt=step_of(trial.period))
-        plant.set("encoder.resolution", 0.0)
+        if "encoder.resolution" in plant.names:
+            plant.set("encoder.resolution", 0.0)
         return plant
 
     def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:

@@ -8,7 +8,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.units import any_unit, linear_unit, same_unit
 
-from .effect import effect_of, load_class
+from .effect import call_own, effect_of, load_class
 from .objects import GraspObject
 from .plant import DEFAULT_DT, Plant
 
@@ -60,7 +60,16 @@ def make_plant(model: Model, grasp: GraspObject | None = None, *, dt: float | No
         return MujocoPlant(model, grasp, dt=step)
     if ":" in model.plant:
         file, _, name = model.plant.rpartition(":")
-        plant: Any = load_class(file, name, "plant")(model, grasp, dt=step)
+        kind = load_class(file, name, "plant")
+        plant: Any = call_own(
+            f"{name}(model, grasp, dt=...) in '{file}'", lambda: kind(model, grasp, dt=step)
+        )
+        members = [*Plant.__annotations__, *(n for n in vars(Plant) if not n.startswith("_"))]
+        if missing := [n for n in members if not hasattr(plant, n)]:
+            raise HannesError(
+                f"The plant '{model.plant}' has no {', '.join(missing)}; a plant has {', '.join(members)} "
+                "(hannes_sim/plant.py says what they are; a subclass of hannes_sim.reduced.ReducedPlant has them)."
+            )
         return plant  # type: ignore[no-any-return]
     raise HannesError(
         f"Model '{model.name}': unknown plant '{model.plant}'; valid are {', '.join(PLANTS)}, or "
