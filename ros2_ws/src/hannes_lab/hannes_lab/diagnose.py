@@ -72,7 +72,7 @@ def effect_sources(
             first = out[name] if ":" in out[name] else f"the catalogue's {name}"
             raise HannesError(
                 f"Two effects are named '{name}': {first} and {given}. Give yours a name of its own, or leave the "
-                "other one out (--only names the effects that take part)."
+                'other one out (--only, on the page "Diagnose with these only", names the effects that take part).'
             )
     have = {effect.name for effect in model.effects} if model is not None else set()
     return {name: given for name, given in out.items() if name not in have}

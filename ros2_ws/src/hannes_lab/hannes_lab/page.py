@@ -235,6 +235,8 @@ class _View:
             button.set_enabled(not work.running)
         self.add.set_enabled(not work.running and bool(self.effects.value))
         self.only.set_enabled(not work.running and bool(self.effects.value))
+        if not self.effects.value:
+            self.only.value = False
         self.cancel.set_enabled(work.running)
         if not self._titles and work.titles:
             self._offer(work.titles)
