@@ -13,10 +13,20 @@ from typing import Any
 
 import pytest
 from hannes_description.errors import HannesError
+from hannes_lab.compare import MetricRow
 from hannes_lab.pictures import write_picture
 from hannes_lab.report import embedded_json, render_report, write_report
 from hannes_lab.report_next import next_step
-from hannes_lab.report_text import interval, number, percent, plus_minus, ratio, signed_percent, unit
+from hannes_lab.report_text import (
+    interval,
+    number,
+    percent,
+    plus_minus,
+    ratio,
+    relative_error,
+    signed_percent,
+    unit,
+)
 
 NAN = math.nan
 TIME = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
@@ -721,6 +731,12 @@ def test_picture_as_svg_is_the_same_every_time(tmp_path: Path) -> None:
         (percent(0.0), "0\u00a0%"),
         (signed_percent(-8.25), "−8.2\u00a0%"),
         (signed_percent(3.0), "+3.0\u00a0%"),
+        (relative_error(MetricRow("a", "b", "A", 2.0, 0.1, 1.5, 25.0).to_dict()), "+25.0\u00a0%"),
+        (
+            relative_error(MetricRow("a", "b", "A", 0.02, 0.001, 1.18, -5800.0).to_dict()),
+            "59\u00a0× too large",
+        ),
+        (relative_error(MetricRow("a", "b", "A", 0.02, 0.03, 1.18, -5800.0).to_dict()), "–"),
         (signed_percent(0.01), "0.0\u00a0%"),
         (plus_minus(0.26739, 0.00192), "0.2674 ± 0.0019"),
         (plus_minus(0.877, 2e-16), "0.877 ± 0"),

@@ -118,9 +118,6 @@ ReportFile = Annotated[Path | None, typer.Option("--report", help=f"Write {REPOR
 _JOBS = max(1, cpu_count())
 """Cores that this process may use: fewer than the machine has in a container or a batch job."""
 
-MANY_TIMES = 5.0
-"""Model over measured value from which their ratio is shown instead of the relative error."""
-
 
 class _Progress:
     """Progress on stderr: a bar on a terminal, a line every few seconds elsewhere."""
@@ -344,12 +341,9 @@ def _show_comparison(result: Comparison) -> None:
 
 def _relative_error(row: MetricRow) -> str:
     """In percent, in words where the model is many times as large; unknown where the measured value may be zero."""
-    if not abs(row.measured) > (row.sd if math.isfinite(row.sd) else 0.0):
+    if not row.nonzero:
         return "-"
-    ratio = row.model / row.measured
-    if abs(ratio) < MANY_TIMES:
-        return f"{number(row.relative_error_percent, 3)} %"
-    return f"{abs(ratio):.2g} x too large" + (", other sign" if ratio < 0.0 else "")
+    return row.many_times or f"{number(row.relative_error_percent, 3)} %"
 
 
 @interruptible

@@ -83,6 +83,10 @@ class Overlay:
         return out
 
 
+MANY_TIMES = 5.0
+"""Model over measured value from which their ratio is shown instead of the relative error."""
+
+
 @dataclass(frozen=True)
 class MetricRow:
     """One of the thesis' figures: mean over closures, standard deviation, model, relative error in percent (P22)."""
@@ -95,8 +99,21 @@ class MetricRow:
     model: float
     relative_error_percent: float
 
+    @property
+    def nonzero(self) -> bool:
+        """Whether the measured value differs from 0 by more than it scatters: else a relative error says nothing."""
+        return bool(abs(self.measured) > (self.sd if np.isfinite(self.sd) else 0.0))
+
+    @property
+    def many_times(self) -> str:
+        """By how many times the model is too large, in words, where that says more than percent; else empty."""
+        ratio = self.model / self.measured if self.nonzero else 0.0
+        if abs(ratio) < MANY_TIMES:
+            return ""
+        return f"{abs(ratio):.2g} x too large" + (", other sign" if ratio < 0.0 else "")
+
     def to_dict(self) -> dict[str, Any]:
-        return self.__dict__.copy()
+        return {**self.__dict__, "nonzero": self.nonzero, "many_times": self.many_times}
 
 
 @dataclass(frozen=True)

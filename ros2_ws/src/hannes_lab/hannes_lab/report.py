@@ -127,7 +127,7 @@ def render_report(
         percent=text.percent,
         words=text.words,
         unit=text.unit,
-        signed_percent=text.signed_percent,
+        relative_error=text.relative_error,
         plus_minus=text.plus_minus,
         fixed=lambda v, n=2: text.DASH if text.known(v) is None else text.fixed(v, n),
     )

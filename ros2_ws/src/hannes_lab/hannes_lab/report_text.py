@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 DASH = "–"
@@ -73,6 +73,15 @@ def percent(value: Any, places: int = 0) -> str:
     if 1.0 - 0.5 * 10.0 ** (-2 - places) < v < 1.0:
         return f"> {fixed(100.0 - 10.0**-places, places)}\u00a0%"
     return f"{fixed(100.0 * v, places)}\u00a0%"
+
+
+def relative_error(metric: Mapping[str, Any]) -> str:
+    """That of a figure of the thesis: in percent, in words where it is many times too large, unknown beside nothing."""
+    if not metric.get("nonzero", True):
+        return DASH
+    return str(metric.get("many_times") or "").replace(" x ", "\u00a0× ") or signed_percent(
+        metric.get("relative_error_percent")
+    )
 
 
 def signed_percent(value: Any) -> str:
