@@ -29,6 +29,8 @@ from .cache import Store, code_hash
 
 # joblib replaces a worker whose memory has grown; its items are done by the next one.
 warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given", category=UserWarning)
+# Ctrl-C is one line; that work under way was lost goes without saying.
+warnings.filterwarnings("ignore", message=".*tasks which were still being processed", category=UserWarning)
 
 P = ParamSpec("P")
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -689,6 +690,9 @@ def _in_workers(work: Sequence[_Work], jobs: int) -> Iterator[_Made]:
     from joblib.externals.loky import get_reusable_executor
 
     whole = False
+    warnings.filterwarnings(
+        "ignore", message=".*tasks which were still being processed", category=UserWarning
+    )
     try:
         yield from Parallel(n_jobs=jobs, return_as="generator")(delayed(_make_part)(*item) for item in work)
         whole = True
