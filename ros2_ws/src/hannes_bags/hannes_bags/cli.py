@@ -24,17 +24,18 @@ def info(
 ) -> None:
     """Tell what a bag holds (topics, types, counts, times, metadata) and that it is intact."""
     bags = find_bags([bag])
+    single = bags == [bag]
     found, broken = [], []
     for one in bags:
         try:
             found.append(bag_info(one))
         except HannesError as error:
-            if bags == [bag]:
+            if single:
                 raise
             broken.append(str(error))
     if json:
         answers = [info_dict(one) for one in found]
-        content = answers[0] if bags == [bag] else answers
+        content = answers[0] if single else answers
         typer.echo(json_module.dumps(content, indent=2, sort_keys=True, allow_nan=False))
     else:
         typer.echo("\n\n".join(map(_words, found)))

@@ -196,8 +196,7 @@ def _answer(prepared: Prepared, search: Search, max_effects: int, greedy: bool) 
             effect, how = in_the_law(choice.search, choice.best)
             with_it, choice, falls = falls[-1], fewer, falls_of(fewer, search)
             said = law_sentence(effect, how, with_it.held_out, min(fall.held_out for fall in falls))
-            named = bool(choice.best.names)
-            choice = replace(choice, **({"notes": (*choice.notes, said)} if named else {"idle": said}))
+            choice = _with_unnamed(choice, said)
         choice, falls = without_idle(choice, falls)
         first, instead = _named_instead(choice, search)
         if instead is not choice:
@@ -302,8 +301,12 @@ def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple
         return replace(choice, notes=(*choice.notes, led_back_sentence(choice.best, part))), falls
     fewer = falls[: keep + 2]
     idle = idle_sentence(choice.best, part, falls[-1], fewer[-1])
-    cut = cut_to(choice, part)
-    return replace(cut, notes=(*cut.notes, idle)) if part.names else replace(cut, idle=idle), fewer
+    return _with_unnamed(cut_to(choice, part), idle), fewer
+
+
+def _with_unnamed(choice: Choice, said: str) -> Choice:
+    """The choice with a sentence on effects that fit better and are not named: in the summary where none is."""
+    return replace(choice, notes=(*choice.notes, said)) if choice.best.names else replace(choice, idle=said)
 
 
 def _foretells(falls: Sequence[Fall]) -> bool:

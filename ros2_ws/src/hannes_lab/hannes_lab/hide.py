@@ -28,7 +28,7 @@ from hannes_sim.rollout import Rollout, rollout
 from numpy.typing import NDArray
 
 from .hand import make_controller
-from .trials import Closure, Trial
+from .trials import CONTROL_PERIOD, Closure, Trial
 
 Array = NDArray[np.float64]
 
@@ -68,13 +68,12 @@ REST = 0.5
 """s of rest before the first closure."""
 
 
-def empty_trial(condition: str, period: float = 1e-3) -> Trial:
+def empty_trial(condition: str) -> Trial:
     """A closure of which nothing was recorded: what a model's own code is tried on."""
-    spec = CONDITIONS[condition]
+    spec, period = CONDITIONS[condition], CONTROL_PERIOD
     reference = spec.reference(period, 1.0 / period)
-    return Trial(
-        condition, period, reference, {}, (Closure(0.0, spec.period, condition),), {"object": spec.grasp}
-    )
+    closure = Closure(0.0, spec.period, condition)
+    return Trial(condition, period, reference, {}, (closure,), {"object": spec.grasp})
 
 
 @dataclass(frozen=True)

@@ -184,14 +184,13 @@ def prepare(
     hand = rig is None
     rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
     check_parameters(rig, model)
-    if hand and isinstance(rig, PlantRig):
+    if isinstance(rig, PlantRig):
         check_own_code(rig, model)
+    if hand:
         trials = with_seen_objects(with_one_clock(trials, model), model)
         rig = HandRig(trials)
     strange = not isinstance(rig, HandRig)
     told = check_rig(rig, model) if strange else []
-    if not hand and isinstance(rig, PlantRig):
-        check_own_code(rig, model)
     known = dict.fromkeys((*SIGNALS, "motor_effort", *(s for t in trials for s in t.signals)))
     present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
     unknown = [s for s in signals or () if s not in present]

@@ -63,7 +63,7 @@ from .ports import (
 )  # fmt: skip
 
 FASTEST = 1e4
-"""rad/s; a machine that is faster has diverged, whatever its effects give."""
+"""rad/s or m/s; a machine that is faster has diverged, whatever its effects give."""
 
 
 @njit(cache=True)
@@ -80,12 +80,10 @@ def evaluate_effects(handle):  # type: ignore[no-untyped-def]
     for k in range(table[0]):
         call_effect(table[1 + 3 * k], x, table[2 + 3 * k], table[3 + 3 * k], y)
     if table[0] > 0:
-        a = b = c = 0.0  # three sums that wait for each other less than one does
-        for k in range(0, N_OUTPUTS, 3):
-            a += out[k]
-            b += out[k + 1]
-            c += out[k + 2]
-        if not math.isfinite(a + b + c):
+        total = 0.0
+        for k in range(N_OUTPUTS):
+            total += out[k]
+        if not math.isfinite(total):
             given = pointer_f8(x)
             if math.isfinite(given[Q] + given[QL]) and abs(given[V]) < FASTEST:
                 pointer_f8(handle[H_STATE])[S_UNDEFINED] = 1.0

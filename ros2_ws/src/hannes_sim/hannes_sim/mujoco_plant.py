@@ -47,7 +47,7 @@ from numba import cfunc
 from numpy.typing import NDArray
 
 from .effect import BoundEffects
-from .motor import begin_step, evaluate_effects, motor_torque, sense
+from .motor import FASTEST, begin_step, evaluate_effects, motor_torque, sense
 from .native import ADVANCE_SIGNATURE, call_2, pointer_f8, pointer_i8
 from .objects import GraspObject
 from .plant import DEFAULT_DT, NOT_NEGATIVE, POSITIVE, PlantDiverged, Reading
@@ -144,9 +144,6 @@ _T_J, _T_W, _T_FRICTION, _T_DAMPING, _T_PAIRS = 0, N_JOINTS, 2 * N_JOINTS, 3 * N
 
 _N_IMPEDANCE = mujoco.mjNIMP
 
-_FASTEST = 1e4
-"""rad/s or m/s; beyond it the simulation has diverged."""
-
 _FATAL = tuple(
     int(w)
     for w in (
@@ -183,7 +180,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
             vl += table[_T_J + j] * qvel[count[_C_JOINTS + j]]
         q, v = qpos[motor] / r, qvel[motor] / r
         for j in range(count[_C_NQ]):
-            if bad == 0.0 and not (math.isfinite(qpos[j]) and abs(qvel[j]) < _FASTEST):
+            if bad == 0.0 and not (math.isfinite(qpos[j]) and abs(qvel[j]) < FASTEST):
                 bad = 1.0 + j
         if k == steps or bad != 0.0:
             break
@@ -582,7 +579,7 @@ class MujocoPlant:
         joint = self._suspect(code)
         reason = "its time does not match the steps taken"
         if code > 0.0:
-            reason = f"joint '{joint}' is not finite or faster than {_FASTEST:.0e}"
+            reason = f"joint '{joint}' is not finite or faster than {FASTEST:.0e}"
         elif code < 0.0:
             warning = mujoco.mjtWarning(int(-code) - 1).name.removeprefix("mjWARN_")
             reason = f"MuJoCo warns of {warning}, joint '{joint}'"
