@@ -1,7 +1,7 @@
 """EMPS, a real positioning axis (motor, ball screw, carriage), for the lab: reader, control law, tolerances.
 
-Data: DATA_EMPS.mat of Janot, Gautier, Brunot, "Data set and reference models of EMPS", Nonlinear System Identification
-Benchmarks 2019; not part of the project.  Position in m, drive in N; one closure is one move of a lap.
+Data: DATA_EMPS.mat of Janot, Gautier, Brunot, "EMPS", Nonlinear System Identification Benchmarks 2019; not part of the
+project.  t [s], reference qg and position qm [m], drive vir [V], gtau [N/V] (motor.kt too); a closure is a move.
 """
 
 import hashlib

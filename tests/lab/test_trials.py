@@ -278,7 +278,26 @@ def test_of_messages_of_one_instant_the_last_holds(rate: float) -> None:
 def test_a_fast_log_is_held_as_the_controller_does() -> None:
     at = np.arange(0.0, 1.0, 0.01)
     filled, note = reference_on_grid(at, np.arange(100.0), 1e-3, 0.999)
-    assert note is None and filled[15] == 1.0 and filled[19] == 1.0 and filled[20] == 2.0
+    assert filled[15] == 1.0 and filled[19] == 1.0 and filled[20] == 2.0
+    assert note is not None and "100 Hz; each message is held" in note
+    fast = np.arange(0.0, 1.0, 0.004)
+    assert reference_on_grid(fast, fast, 1e-3, 0.9)[1] is None
+
+
+def test_a_recording_may_say_whether_its_reference_is_held() -> None:
+    said: tuple[dict[str, object], ...] = ({"reference_held": True}, {"reference_held": False}, {})
+    held, filled, unsaid = (
+        make_trial(recording(half_sine(3), 100.0, metadata={"condition": "slow", **meta})).reference
+        for meta in said
+    )
+    assert np.unique(held).size < np.unique(filled).size / 5
+    assert np.array_equal(unsaid, filled)
+    logged = make_trial(
+        recording(half_sine(3), 100.0, metadata={"sensors": {"current_rectified": False}})
+    ).reference
+    assert np.array_equal(logged, held)
+    with pytest.raises(HannesError, match="`reference_held` is 'yes'"):
+        make_trial(recording(half_sine(3), 100.0, metadata={"reference_held": "yes"}))
 
 
 def test_an_outlier_closure_is_left_out() -> None:

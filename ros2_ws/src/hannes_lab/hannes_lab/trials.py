@@ -276,9 +276,14 @@ def reference_on_grid(
     time, values = time[later], values[later]
     grid = np.arange(max(2, math.floor(duration / period + 1e-6) + 1)) * period
     step = float(np.median(np.diff(time))) if time.size > 1 else period
+    # Stamps in whole milliseconds: at 60 Hz the median step is 17 ms.
+    steps = np.diff(time)
+    rate = 1.0 / float(steps[steps < 1.5 * step].mean()) if time.size > 1 else 1.0 / period
+    said = f"the reference is logged at {rate:.0f} Hz; "
     if time.size < 4 or 1.0 / step >= hold_rate:
         index = np.clip(np.searchsorted(time, grid + 1e-7, side="right") - 1, 0, time.size - 1)
-        return values[index], None
+        slow = time.size >= 4 and 1.0 / step < STRANGE_HOLD_RATE
+        return values[index], said + "each message is held until the next" if slow else None
     from scipy.interpolate import PchipInterpolator
 
     out = np.interp(grid, time, values)
@@ -313,10 +318,7 @@ def reference_on_grid(
         if last < time.size - 1:
             edge = (grid > t[-1]) & (grid < time[last + 1])
             out[edge] = np.interp(grid[edge], [t[-1], right], [v[-1], rest])
-    # Stamps in whole milliseconds: at 60 Hz the median step is 17 ms.
-    steps = np.diff(time)
-    rate = 1.0 / float(steps[steps < 1.5 * step].mean())
-    return out, f"the reference is logged at {rate:.0f} Hz; between samples it is interpolated"
+    return out, said + "between samples it is interpolated"
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -536,6 +538,19 @@ def control_period(recording: Recording) -> float:
     return float(given)
 
 
+def _hold_rate(recording: Recording) -> float:
+    """Hz from which on the reference is held from message to message: what the metadata say, or the usual one."""
+    held = recording.metadata.get("reference_held")
+    if held is None:
+        return ZERO_ORDER_HOLD_RATE if "sensors" in recording.metadata else STRANGE_HOLD_RATE
+    if not isinstance(held, bool):
+        raise HannesError(
+            f"{recording.source}: its `reference_held` is {held!r}; it must be true (the controller holds each message "
+            "until the next) or false (what was logged is a part of what it reads: filled by a smooth curve)."
+        )
+    return 0.0 if held else math.inf
+
+
 def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     """The trial of a recording in SI with nothing but what is compared."""
     notes = list(recording.warnings)
@@ -552,12 +567,7 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
         for s, c in recording.channels.items()
     }
     logged = samples.pop("reference_position")
-    reference, note = reference_on_grid(
-        *logged,
-        period,
-        duration,
-        ZERO_ORDER_HOLD_RATE if "sensors" in meta else STRANGE_HOLD_RATE,
-    )
+    reference, note = reference_on_grid(*logged, period, duration, _hold_rate(recording))
     if note:
         notes.append(note)
     begin = max(float(t[0]) for t, _ in samples.values())
