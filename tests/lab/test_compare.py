@@ -59,7 +59,9 @@ def test_an_offset_depends_on_nothing_and_without_an_encoder_place_and_speed_are
         """Shares for closures that differ from the model by an error as a function of the predicted signal."""
         chosen = [(b, c) for b, c in zip(features.blocks, predicted, strict=True) if b.signal in signals]
         blocks = tuple(replace(b, measured=c + error(c)) for b, c in chosen)
-        found = residual_dependences(replace(features, blocks=blocks, slices=()), [c for _, c in chosen])
+        found = residual_dependences(
+            replace(features, blocks=blocks, slices=()), [c for _, c in chosen], prepared.rig.drive_signals
+        )
         return {d.variable: d.share for d in found}
 
     both = ("encoder_position", "motor_current")
@@ -68,3 +70,5 @@ def test_an_offset_depends_on_nothing_and_without_an_encoder_place_and_speed_are
     assert max(of_load, key=lambda name: of_load[name]) == "load" and of_load["load"] > 0.5
     assert set(of_load) == {"position", "velocity", "direction", "load", "time"}
     assert set(shares(lambda c: 0.1 * c**2, features, "motor_current")) == {"load", "time"}
+    without = shares(lambda c: 0.1 * c**2, features, "encoder_position")
+    assert set(without) == {"position", "velocity", "direction", "time"}, "no signal tells the load"

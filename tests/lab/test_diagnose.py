@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,15 +16,16 @@ from hannes_lab.add import add_effects
 from hannes_lab.chance import chance
 from hannes_lab.choose import Choice, pruned, tie_width
 from hannes_lab.compare import compare
-from hannes_lab.diagnose import diagnose, effect_sources, without_idle, without_law
-from hannes_lab.diagnosis import Diagnosis, Fall
-from hannes_lab.falls import fall_sentence
+from hannes_lab.diagnose import diagnose, effect_sources, found_effects, without_idle, without_law
+from hannes_lab.diagnosis import Diagnosis, Fall, FoundEffect
+from hannes_lab.errors import SignalError
+from hannes_lab.falls import fall_sentence, relative_errors, worth_showing
 from hannes_lab.fit import Fit, fit
 from hannes_lab.hide import DEFAULT_CONDITIONS, Truth, make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.search import Candidate, Search
 from hannes_lab.trials import make_trial
-from hannes_lab.wording import bent_sentence, law_sentence
+from hannes_lab.wording import bent_sentence, law_sentence, notes, worse_fitted
 from hannes_sim.effect import load_effect, strength_of
 
 CLOSURES = 8
@@ -494,6 +496,46 @@ def test_how_another_machines_law_sets_in_is_not_named_where_the_rest_explains_a
     assert without_law(choice) is choice, "gravity alone does not explain it"
     said = law_sentence("presliding_friction", "length 0.009 rad, 0.06 % of the travel", 1.6, 2.6)
     assert "1.60 instead of 2.60" in said and "hannes add --effect presliding_friction" in said
+
+
+def test_without_repeats_what_only_fits_better_is_not_shown() -> None:
+    """There is no repeatability: the error on held-out conditions, in the signals' units, decides."""
+
+    def fall(added: str, position: float, current: float) -> Fall:
+        nan, signals = float("nan"), {"encoder_position": position, "motor_current": current}
+        return Fall(added, nan, nan, {}, (), signals)
+
+    given, fitted = fall("nominal, as given", 0.02, 0.5), fall("nominal, fitted", 0.04, 0.5)
+    worse, better = fall("supply_sag", 0.06, 0.4), fall("supply_sag", 0.03, 0.5)
+    assert relative_errors((given, fitted, worse))[1:] == pytest.approx([1.0, np.sqrt((1.5**2 + 0.8**2) / 2)])
+    found = {(): "null", ("supply_sag",): "sag"}
+    search: Any = SimpleNamespace(fit_of=lambda names: found[tuple(names)])
+    best: Any = SimpleNamespace(names=("supply_sag",))
+    assert worth_showing(search, best, (given, fitted, worse)) == ("null", (given, fitted))
+    assert worth_showing(search, best, (given, fitted, better)) == (best, (given, fitted, better))
+    (note,) = worse_fitted((given, fitted))
+    assert "as fitted (on conditions that were left out) than as given (0.79 of the error)" in note
+    unknown = replace(given, held_out_signals={}), replace(fitted, held_out_signals={})
+    assert not worse_fitted(unknown)
+
+
+def test_an_interval_that_the_end_of_the_range_cuts_is_said(gloved: Search) -> None:
+    best = gloved.fitted(("glove_stiffness",))
+    limits = chance(gloved.problem, best.fit, gloved.signatures(best))
+    missed = SignalError("slow", "motor_current", "A", 0.1, 0.05, 2.0)
+    (effect,) = found_effects(gloved, best, limits, (Fall("", 1.0, 1.0, {}, (missed,)),) * 2)
+    main = next(iter(effect.parameters))
+    whole = next(c for c in best.fit.coordinates if c.name == f"glove_stiffness.{main}")
+    p = replace(effect.parameters[main], high=whole.upper, identified=True)
+    cut = replace(effect, parameters={**effect.parameters, main: p})
+
+    def said(one: FoundEffect) -> list[str]:
+        told = notes(gloved, best, "effects", [one], (), False, None)
+        return [note for note in told if f"interval of glove_stiffness.{main}" in note]
+
+    assert not said(effect)
+    (note,) = said(cut)
+    assert f"cut at the end of its range ({whole.lower:g} to {whole.upper:g})" in note
 
 
 def test_an_error_that_rises_is_said_to_rise() -> None:

@@ -321,6 +321,9 @@ def test_signals_by_another_clock_than_the_reference_are_noticed_and_can_be_fitt
     before = found()
     (note,) = (n for n in before.notes if "clock" in n)
     assert "signals were earlier than the reference's clock says, by 3 ms" in note
+    alone = diagnose(prepare(rig.read([path]), model, rig=rig), effect_sources(only=["coulomb_friction"]))
+    assert alone.verdict == "unknown"
+    assert "First look at the clock: what is left looks as if the signals were earlier" in alone.summary
     tolerances = tmp_path / "tolerances.yaml"
     known = tolerances.read_text()
     tolerances.write_text(
@@ -377,6 +380,61 @@ def test_an_effect_that_may_be_nought_at_the_end_is_left_out(
     assert found.tied == (("coulomb_friction",),) and found.falls[-1].added == "coulomb_friction"
     assert any("cogging joined too" in note for note in found.notes)
     assert [effect.name for effect in found.model.effects] == ["coulomb_friction"]
+
+
+def test_what_is_left_of_a_pair_is_judged_by_itself(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a pair one may be nought at its end: then the other one must have lowered the error without it."""
+    only = effect_sources(only=["coulomb_friction", "cogging"])
+    monkeypatch.setattr(
+        "hannes_lab.diagnose._may_be_nought", lambda search, found, limits: found.names[-1] == "cogging"
+    )
+    monkeypatch.setattr("hannes_lab.diagnose.EACH_TAKES", 0.9999)
+    found = diagnose(prepared, only)
+    assert found.verdict == "unknown" and not found.effects and not found.tied
+    assert any("coulomb_friction joined too" in n and "must fall by 100 %" in n for n in found.notes)
+    assert len(found.falls) == 2 and not found.model.effects
+
+
+def test_where_all_that_joined_may_be_nought_nothing_is_named(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hannes_lab.diagnose._may_be_nought", lambda search, found, limits: True)
+    for module in ("diagnose", "choose"):  # as of data that the model alone explains
+        monkeypatch.setattr(f"hannes_lab.{module}.is_adequate", lambda *args, **how: True)
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction"]))
+    assert found.verdict == "nothing" and not found.effects and not found.model.effects
+    assert any("coulomb_friction joined too, but" in note for note in found.notes)
+
+
+def test_a_fit_stays_inside_the_bounds_of_the_parameters_file(tmp_path: Path) -> None:
+    """A mass that was weighed is no lighter, whatever that would explain, and it is said."""
+    rng = np.random.default_rng(6)
+    write_files(tmp_path)
+    rig, model = load_rig(ADAPTER), Model.load(tmp_path / "mass.yaml")
+    light = model.with_values({"motor.armature": 1.7})
+    run = rollout(make_plant(light), rig([]).controller(light, 1e-3), reference())
+    noise = rng.standard_normal((2, run.time.size))
+    path = tmp_path / "light.npz"
+    position, force = run.encoder_position + 2e-7 * noise[0], run.motor_voltage + 0.02 * noise[1]
+    np.savez(path, reference=run.reference_position, position=position, force=force)
+    free = diagnose(prepare(rig.read([path]), model, rig=rig), effect_sources(only=["wire_slack"]))
+    assert free.verdict == "nothing" and free.values["motor.armature"] == pytest.approx(1.7, rel=1e-3)
+    parameters = tmp_path / "parameters.yaml"
+    parameters.write_text(
+        parameters.read_text().replace("lower: 0.5, upper: 10.0", "lower: 1.9, upper: 10.0")
+    )
+    weighed = Model.load(tmp_path / "mass.yaml")
+    held = diagnose(prepare(rig.read([path]), weighed, rig=rig), effect_sources(only=["coulomb_friction"]))
+    assert held.values["motor.armature"] >= 1.9 and held.verdict != "nothing"
+    assert held.model.parameters["motor.armature"].lower == 1.9
+    assert any("the fit holds motor.armature at 1.9 kg, the end of its range" in note for note in held.notes)
+    parameters.write_text(parameters.read_text().replace("lower: 1.9, upper: 10.0", "lower: 2.0, upper: 2.0"))
+    with pytest.raises(
+        HannesError, match=r"'motor.armature' has a tolerance, but its bounds hold it at 2 kg"
+    ):
+        prepare(rig.read([path]), Model.load(tmp_path / "mass.yaml"), rig=rig)
 
 
 def test_an_effect_with_which_left_out_closures_are_foretold_worse_is_left_out(

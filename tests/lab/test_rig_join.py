@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.compare import compare
+from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.rig import load_rig
 from hannes_lab.trials import Closure, Trial
@@ -88,6 +90,57 @@ def test_what_cannot_be_told_stays_apart_and_is_told_apart(rig: type) -> None:
     assert {o.condition for o in result.overlays} == {"x (x0)", "x (x1)"}
     (said,) = prepared(rig, *(replace(t, fresh=True) for t in blind)).features.trials
     assert len(said.closures) == 2
+
+
+def test_why_files_of_one_condition_are_not_taken_together_is_said(rig: type) -> None:
+    one, two = moves(rig, "x", 0.05, 0.0, 2, fresh=True)
+    time, force = two.signals["drive_force"]
+    other = replace(two, signals={**two.signals, "drive_force": (time, force + 0.2 * np.ptp(force))})
+    notes = prepared(rig, one, other).notes
+    assert any("drive_force differs by 20 % of its span, where repeats may by 10 %" in note for note in notes)
+    assert not any("fresh=True" in note for note in notes)
+
+
+def test_noise_of_the_samples_does_not_keep_files_apart(rig: type) -> None:
+    rng = np.random.default_rng(4)
+    noisy = []
+    for trial in moves(rig, "x", 0.05, 0.0, 3):
+        time, force = trial.signals["drive_force"]
+        rough = force + 0.1 * np.ptp(force) * rng.standard_normal(force.size)
+        noisy.append(replace(trial, signals={**trial.signals, "drive_force": (time, rough)}))
+    (trial,) = prepared(rig, *noisy).features.trials
+    assert len(trial.closures) == 3
+
+
+def test_recordings_of_one_file_are_told_by_their_names(rig: type) -> None:
+    of_one = [replace(t, source="all.csv") for t in moves(rig, "x", 0.05, 0.0, 3)]
+    notes = prepared(rig, *of_one).notes
+    assert any("3 recordings repeat one condition and are taken together (x0, x1, x2)" in n for n in notes)
+
+
+def test_without_repeats_conditions_decide_what_is_shown_and_greedy_is_not_advised(rig: type) -> None:
+    far, near = moves(rig, "far", 0.1, 0.0, 1), moves(rig, "near", 0.02, 0.0, 1)
+    bent = []
+    for trial in far + near:
+        time, position = trial.signals["encoder_position"]
+        signals = {**trial.signals, "encoder_position": (time, position + 1e-4 * np.sin(40.0 * time))}
+        bent.append(replace(trial, signals=signals))
+    found = prepared(rig, *bent)
+    sources = effect_sources(only=["coulomb_friction"])
+    answer = diagnose(found, sources)
+    assert answer.verdict == "unknown" and not any("--greedy" in note for note in answer.notes)
+    with pytest.raises(HannesError, match="there are no repeats: record each motion more than once"):
+        diagnose(found, sources, greedy=True)
+
+
+def test_a_travel_unlike_that_of_the_adapter_is_said(rig: type) -> None:
+    class Degrees(rig):
+        sizes = {"N.m": 3.0, "rad": 0.1 / 57.3}
+
+    trials = moves(rig, "far", 0.1, 0.0, 2)
+    notes = prepare(trials, Model.load(rig.model), rig=Degrees).notes
+    assert any("encoder_position goes over 0.1 m, and the adapter's `sizes` say 0.0017" in n for n in notes)
+    assert not any("`sizes` say" in note for note in prepared(rig, *trials).notes)
 
 
 def test_trials_with_many_closures_or_conditions_stay_alone(rig: type) -> None:

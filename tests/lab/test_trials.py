@@ -12,6 +12,7 @@ from hannes_lab.adapter import check_trials
 from hannes_lab.blocks import in_blocks, told_apart
 from hannes_lab.compare import compare
 from hannes_lab.hand import make_controller
+from hannes_lab.phases import PHASES, phase_of
 from hannes_lab.prepare import prepare, without_outliers
 from hannes_lab.trials import (
     Closure,
@@ -385,3 +386,19 @@ def test_noise_of_the_reference_makes_no_further_closures_or_conditions(
     assert len(closures) == 5 and {c.condition for c in closures} == {"soft"}
     every = 2.0 * seconds + 0.3 + rest
     assert np.diff([start for start, _ in spans]) == pytest.approx(every, abs=0.015)
+
+
+def test_a_reference_that_stands_is_at_rest_only_where_others_are_lowest_too() -> None:
+    """A step at the first value: the move is held, not at rest; so is a recording that is nothing else."""
+    stood = np.concatenate([np.full(500, 2.0), np.full(500, 5.0)])
+    at = np.arange(10) * 0.04
+    for reference, spans, expected in (
+        (stood, ((0.0, 0.45), (0.55, 0.95)), ("rest", "hold")),
+        (np.full(1000, 2.7), ((0.0, 0.9),), ("hold",)),
+    ):
+        closures = tuple(Closure(a, b, str(k)) for k, (a, b) in enumerate(spans))
+        signals = {"encoder_position": (np.arange(1000) * 1e-3, reference)}
+        trial = Trial("x", 1e-3, reference, signals, closures)
+        for closure, name in zip(closures, expected, strict=True):
+            found = phase_of(trial, closure, at[at < closure.stop - closure.start - 0.05], None)
+            assert set(found) == {PHASES.index(name)}

@@ -37,6 +37,9 @@ not in seconds.  From the second on it is said."""
 FAR_OFF = 100.0
 """Times that a signal and its simulation may differ in range; a guessed mass or friction makes for less."""
 
+OTHER_SIZE = 20.0
+"""Times that a travel may differ from that of an adapter's `sizes`; degrees for rad are 57."""
+
 SHORTEST = 3.0
 """Control periods that a closure lasts at least."""
 
@@ -332,9 +335,20 @@ def other_units(rig: Rig, model: Model, features: Features) -> list[str]:
     """What is recorded in another unit or sign than the model's, as far as sizes tell.
 
     The encoder against its reference, where the simulated one follows it; every other signal against its simulation,
-    from which a guess of the parameters may be far off.
+    from which a guess of the parameters may be far off.  Of an adapter the encoder against its `sizes`.
     """
     out: dict[str, str] = {}
+    travel = getattr(rig, "sizes", {}).get("rad")
+    moves = {
+        t.unit(ENCODER): float(np.ptp(t.signals[ENCODER][1])) for t in features.trials if ENCODER in t.signals
+    }
+    if travel and moves:
+        unit, most = max(moves.items(), key=lambda item: item[1])
+        if not 1.0 / OTHER_SIZE < most / travel < OTHER_SIZE:
+            out["sizes"] = (
+                f"{ENCODER} goes over {most:.3g} {unit}, and the adapter's `sizes` say {travel:g}: is one of them in "
+                "another unit? The bounds of effects follow from it"
+            )
     for trial, end in zip(features.trials, features.ends, strict=True):
         try:
             simulated = rig.simulate(model, {}, trial, trial.reference[:end])

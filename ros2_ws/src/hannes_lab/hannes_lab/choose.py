@@ -78,6 +78,7 @@ class Choice:
              chance does not explain the rest
     idle     where no effect is named: a sentence on those that fit better, but foretell no better what took no part in
              the fit
+    left     a sentence on what a greedy choice leaves, where something is
     """
 
     search: Search
@@ -89,6 +90,7 @@ class Choice:
     notes: tuple[str, ...] = ()
     enough: bool = False
     idle: str = ""
+    left: str = ""
 
 
 def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -> Choice:
@@ -167,9 +169,8 @@ def can_be_held_out(features: Features) -> bool:
     return len(features.conditions) > 1 and any(block.n > 1 for block in features.blocks)
 
 
-def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects: int) -> Choice:
-    """Effects one after another while the mean square error on held-out conditions falls by at least EACH_TAKES."""
-    features = search.problem.features
+def must_be_held_out(features: Features) -> None:
+    """Refuse a greedy search where the error on conditions that are left out cannot be judged."""
     if not can_be_held_out(features):
         why = (
             "and there is one condition only: record another speed or load"
@@ -179,31 +180,42 @@ def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects
         raise HannesError(
             f"--greedy judges by conditions that took no part in the fit, {why}, or say --no-greedy."
         )
+
+
+def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects: int) -> Choice:
+    """Effects one after another while the mean square error on held-out conditions falls by at least EACH_TAKES."""
     grown = grow(search, null, max_effects, EACH_TAKES)
-    adequate = is_adequate(search, grown.best, limits)
     ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits.median)) for c in grown.first)
-    notes = list(grown.notes)
-    first, last = grown.errors[0], grown.errors[-1]
-    repeats = last <= AS_IT_REPEATS
-    enough = repeats or (bool(grown.best.names) and halved(first, last))
-    instead = (disbelieved(search, grown.best) or led_off(null, grown.best)) if grown.best.names else ""
+    choice = Choice(search, grown.best, limits, False, ranking, grown.rivals, grown.notes)
+    return judged_by_conditions(choice, null, grown.errors[0], grown.errors[-1])
+
+
+def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: float) -> Choice:
+    """The choice of a greedy search with whether it is an answer, and what it leaves.
+
+    first, last  error on held-out conditions of the fitted nominal model, and of the chosen one
+    """
+    search, best, left = choice.search, choice.best, ""
+    adequate, repeats = is_adequate(search, best, choice.limits), last <= AS_IT_REPEATS
+    enough = repeats or (bool(best.names) and halved(first, last))
+    instead = (disbelieved(search, best) or led_off(null, best)) if best.names else ""
     if enough and instead:
         adequate = enough = False
-        notes.append(
+        left = (
             f"what was added lowers the error on held-out conditions to {last:.3g} times the repeatability, but "
             f"{instead}"
         )
     elif enough and not adequate and not repeats:
-        notes.append(
-            f"the {shortfall(search, grown.best, limits)}: something smaller is left that the "
+        left = (
+            f"the {shortfall(search, best, choice.limits)}: something smaller is left that the "
             "catalogue does not explain"
         )
-    elif grown.best.names and not (adequate or enough):
-        notes.append(
+    elif best.names and not (adequate or enough):
+        left = (
             f"what was added lowers the error on held-out conditions from {first:.3g} to {last:.3g} times the "
             "repeatability; less than half would be an answer"
         )
-    return Choice(search, grown.best, limits, adequate, ranking, grown.rivals, tuple(notes), enough)
+    return replace(choice, adequate=adequate, enough=enough, left=left)
 
 
 def halved(first: float, last: float) -> bool:

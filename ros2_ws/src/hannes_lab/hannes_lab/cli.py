@@ -423,7 +423,9 @@ def _show_diagnosis(found: Diagnosis, machine: str) -> None:
     if found.ranking and not has_excess(found.costs, bool(found.effects)):
         console.print("\nThere is no excess misfit that effects could explain: chance explains all of it.")
     elif found.ranking:
-        console.print("\nRanking (part of the excess misfit that each effect explains alone):")
+        console.print(
+            "\nRanking (part of the excess misfit that each effect explains alone; each parameter costs):"
+        )
         for rank in found.ranking[:8]:
             console.print(f"  {100 * rank.explained:5.1f} %  {' + '.join(rank.names)}")
     _show_experiments(console, found.experiments)

@@ -20,7 +20,7 @@ from .features import Block, Features, data_used
 from .phases import METRICS, PHASES, metrics, phase_of
 from .prepare import FEW, Prepared
 from .search import Progress, Search, silent
-from .wording import clock_note
+from .wording import other_clock
 
 Array = NDArray[np.float64]
 
@@ -180,7 +180,8 @@ def compare(
                 progress=progress,
             )
             found = search.null().fit
-            values, own = found.values, clock_note(prepared.problem, found)
+            values, clock = found.values, other_clock(prepared.problem, found)
+            own = [clock.said] if clock else []
     predicted = features.closures(prepared.rig, model, values)
     contact = _contact(prepared, values)
     labels = [_labels(features, block, contact) for block in features.blocks]
@@ -199,7 +200,7 @@ def compare(
             for b, p, lab, title in zip(features.blocks, predicted, labels, titles, strict=True)
         ),
         _metrics(features, predicted, labels) if prepared.rig.figures else (),
-        residual_dependences(features, predicted),
+        residual_dependences(features, predicted, prepared.rig.drive_signals),
         data_used(features),
         (*prepared.notes, *own),
         per_signal(features, [of_blocks]),

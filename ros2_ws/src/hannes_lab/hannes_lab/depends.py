@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,19 +44,26 @@ class Dependence:
         }
 
 
-def residual_dependences(features: Features, predicted: list[Array]) -> tuple[Dependence, ...]:
-    """What the residual of the current (or of the first signal there is) depends on; without an encoder, on load and
-    time only.
+def residual_dependences(
+    features: Features, predicted: list[Array], drive: Sequence[str]
+) -> tuple[Dependence, ...]:
+    """What the residual of the drive's signal depends on, or of the first signal where none is recorded.
+
+    Without an encoder on load and time only; without a drive's signal not on the load, which that tells.
+
+    drive   the signals that show force or torque, see Rig
     """
     residuals: dict[str, list[Array]] = {}
     states: dict[str, list[Array]] = {"position": [], "velocity": [], "direction": [], "load": []}
     for block, closures in zip(features.blocks, predicted, strict=True):
         residuals.setdefault(block.signal, []).append(block.measured - closures)
-    signal = next((s for s in ("motor_current", "motor_effort") if s in residuals), next(iter(residuals)))
+    signal = next((s for s in drive if s in residuals), next(iter(residuals)))
     by = {(b.trial, b.condition, b.signal): (b, c) for b, c in zip(features.blocks, predicted, strict=True)}
-    for trial, condition in [(b.trial, b.condition) for b in features.blocks if b.signal == signal]:
+    places = [(b.trial, b.condition) for b in features.blocks if b.signal == signal]
+    for trial, condition in places:
         target, load = by[(trial, condition, signal)]
-        states["load"].append(load)
+        if signal in drive:
+            states["load"].append(load)
         place = by.get((trial, condition, "encoder_position"))
         if place is not None:
             position = np.interp(target.phase, place[0].phase, place[1].mean(axis=0))
@@ -64,7 +71,7 @@ def residual_dependences(features: Features, predicted: list[Array]) -> tuple[De
             for name, values in (("position", position), ("velocity", velocity), ("direction", velocity)):
                 states[name].append(np.tile(values, (target.n, 1)))
     # Of a set in which the encoder is not logged everywhere, what depends on it is not known.
-    known = {name: values for name, values in states.items() if len(values) == len(states["load"])}
+    known = {name: values for name, values in states.items() if len(values) == len(places)}
     return _dependences(residuals, known, signal)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from .adequacy import in_the_law, is_adequate, leads_back
 from .chance import Chance, chance
 from .choose import (
+    EACH_TAKES,
     MAX_EFFECTS,
     MAX_GREEDY,
     Choice,
@@ -23,6 +24,8 @@ from .choose import (
     choose,
     choose_greedily,
     cut_to,
+    judged_by_conditions,
+    must_be_held_out,
     tied_sets,
 )
 from .depends import residual_dependences
@@ -30,7 +33,7 @@ from .diagnosis import Diagnosis, Fall, FoundEffect, ParameterEstimate
 from .errors import SignalError
 from .executor import Executor
 from .experiments import separating_experiments
-from .falls import error_falls, worth_showing
+from .falls import WITHOUT_EFFECT, error_falls, relative_errors, worth_showing
 from .features import data_used
 from .fit import Fit
 from .prepare import Prepared
@@ -42,6 +45,7 @@ from .wording import (
     law_sentence,
     led_back_sentence,
     notes,
+    other_clock,
     summary,
     worse_fitted,
 )
@@ -98,6 +102,8 @@ def diagnose(
     """
     if greedy is None:
         greedy = prepared.rig.foreign and can_be_held_out(prepared.features)
+    if greedy:
+        must_be_held_out(prepared.features)
     if max_effects is None:
         max_effects = MAX_GREEDY if greedy else MAX_EFFECTS
     if not sources:
@@ -125,26 +131,26 @@ def diagnose(
         best, falls = worth_showing(search, best, falls)
     verdict = "unknown" if not answer.holds else "effects" if best.names else "nothing"
     tied = tied_sets(choice) if verdict == "effects" else ()
-    best, left_out = search.with_spread(best), []
-    while greedy and len(best.names) > 1 and (why := _idle_at_the_end(search, best, limits, falls)):
-        left_out.append(f"{best.names[-1]} joined too, but {why}: it is left out")
-        falls = falls[:-1]
-        best = search.with_spread(search.fit_of(best.names[:-1]))
-        tied = (best.names,) if tied else ()
+    best = search.with_spread(best)
     effects = found_effects(search, best, limits, falls)
+    clock = other_clock(search.problem, best.fit) if greedy or verdict == "unknown" else None
     experiments = (
         separating_experiments(prepared, search, [search.fit_of(n) for n in tied]) if len(tied) > 1 else ()
     )
     return Diagnosis(
         verdict=verdict,
-        summary=summary(search, verdict, effects, tied, falls, limits, choice, best, answer.bent, only),
+        summary=summary(
+            search, verdict, effects, tied, falls, limits, choice, best, answer.bent, only, clock
+        ),
         effects=effects,
         tied=tied,
         experiments=experiments,
         falls=falls,
         ranking=choice.ranking,
         depends_on=residual_dependences(
-            prepared.features, prepared.features.closures(prepared.rig, best.fit.model, best.fit.values)
+            prepared.features,
+            prepared.features.closures(prepared.rig, best.fit.model, best.fit.values),
+            prepared.rig.drive_signals,
         ),
         chance=limits,
         costs={"nominal_fitted": answer.null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
@@ -152,8 +158,8 @@ def diagnose(
         notes=(
             *prepared.notes,
             *choice.notes,
-            *left_out,
-            *notes(search, best, verdict, experiments, greedy),
+            *((choice.left,) if choice.left else ()),
+            *notes(search, best, verdict, effects, experiments, greedy, clock),
             *worse_fitted(falls),
         ),
         simulations=prepared.problem.simulations,
@@ -190,7 +196,10 @@ def _answer(prepared: Prepared, search: Search, max_effects: int, greedy: bool) 
         there = replace(prepared, problem=choice.search.problem)
         return error_falls(there, choice.search, choice.best, first=first, in_order=greedy)
 
-    falls, holds, bent = falls_of(choice, search), choice.adequate or choice.enough, ""
+    falls = falls_of(choice, search)
+    if greedy:
+        choice, falls = _borne_out(choice, null, falls)
+    holds, bent = choice.adequate or choice.enough, ""
     if holds and not greedy:
         if (fewer := without_law(choice)) is not choice:
             effect, how = in_the_law(choice.search, choice.best)
@@ -205,13 +214,43 @@ def _answer(prepared: Prepared, search: Search, max_effects: int, greedy: bool) 
     return _Answer(null, choice, falls, bent, holds and not bent)
 
 
-def _idle_at_the_end(search: Search, found: Candidate, limits: Chance, falls: Sequence[Fall]) -> str:
-    """Why the last effect that was added greedily is none; empty if it is one."""
+def _borne_out(choice: Choice, null: Candidate, falls: tuple[Fall, ...]) -> tuple[Choice, tuple[Fall, ...]]:
+    """A greedy choice without the effects at its end that are none, and then judged again.
+
+    What joined as one of a pair must take its part by itself once the other has gone.
+    """
+    search, limits, notes = choice.search, choice.limits, choice.notes
+    best = search.with_spread(choice.best)
+    alone = False
+    while best.names and (why := _idle_at_the_end(search, best, limits, falls, alone)):
+        notes += (f"{best.names[-1]} joined too, but {why}: it is left out",)
+        falls, alone = falls[:-1], True
+        best = search.with_spread(search.fit_of(best.names[:-1]))
+    if not alone:
+        return choice, falls
+    first, last = falls[WITHOUT_EFFECT - 1].held_out_conditions, falls[-1].held_out_conditions
+    fewer = replace(choice, best=best, rivals=(), notes=notes)
+    return judged_by_conditions(fewer, null, first, last), falls
+
+
+def _idle_at_the_end(
+    search: Search, found: Candidate, limits: Chance, falls: Sequence[Fall], alone: bool
+) -> str:
+    """Why the last effect that was added greedily is none; empty if it is one.
+
+    alone   what joined after it, maybe as one of a pair, has gone
+    """
     if _may_be_nought(search, found, limits):
         return "by its 95 % intervals its strength may be nought"
     before, after = falls[-2].held_out, falls[-1].held_out
     if after > before:
         return f"the error on held-out closures rises with it from {before:.3g} to {after:.3g} times the repeatability"
+    before, after = falls[-2].held_out_conditions, falls[-1].held_out_conditions
+    if alone and after**2 > (1.0 - EACH_TAKES) * before**2:
+        return (
+            f"the error on held-out conditions changes with it from {before:.3g} to {after:.3g} times the "
+            f"repeatability only; its mean square must fall by {100 * EACH_TAKES:.0f} %"
+        )
     return ""
 
 
@@ -315,11 +354,10 @@ def _foretells(falls: Sequence[Fall]) -> bool:
     On either: what a condition has of its own, like an object, cannot be foretold from the others.  The nominal model
     as it was given is one of those before: its fit weighs what a model of its form may be off, and may raise the error.
     """
-    known = [
-        errors
-        for errors in ([f.held_out for f in falls], [f.held_out_conditions for f in falls])
-        if np.isfinite(errors[1:]).all()
-    ]
+    measures = ([f.held_out for f in falls], [f.held_out_conditions for f in falls])
+    known = [errors for errors in measures if np.isfinite(errors[1:]).all()]
+    if not known:
+        known = [errors for errors in [relative_errors(falls)] if np.isfinite(errors[1:]).all()]
     return not known or any(e[-1] ** 2 <= (1.0 - FORETOLD) * np.nanmin(e[:-1]) ** 2 for e in known)
 
 

@@ -105,8 +105,13 @@ def _problem_builder(search: Search, rig: Rig, values: Mapping[str, float]) -> A
 def worth_showing(
     search: Search, best: Candidate, falls: tuple[Fall, ...]
 ) -> tuple[Candidate, tuple[Fall, ...]]:
-    """The effects up to that with which the error on held-out closures is least: what follows only fits better."""
+    """The effects up to that with which the error on held-out closures is least: what follows only fits better.
+
+    The error on held-out conditions where no closure was repeated.
+    """
     errors = [fall.held_out for fall in falls[1:]]
+    if not np.isfinite(errors).any():
+        errors = relative_errors(falls)[1:]
     if not np.isfinite(errors).any():
         return best, falls
     keep = 1 + int(np.nanargmin(errors))
@@ -114,6 +119,19 @@ def worth_showing(
     if len(names) == len(best.names):
         return best, falls
     return search.fit_of(names), falls[: keep + 1]
+
+
+def relative_errors(falls: Sequence[Fall]) -> list[float]:
+    """Error on held-out conditions in multiples of the fitted nominal model's, root mean square over signals.
+
+    It needs no repeatability; NaN where no condition could be held out.
+    """
+    base = falls[WITHOUT_EFFECT - 1].held_out_signals
+    out = []
+    for fall in falls:
+        ratios = [fall.held_out_signals.get(s, np.nan) / error for s, error in base.items() if error > 0.0]
+        out.append(float(np.sqrt(np.mean(np.square(ratios)))) if ratios else float("nan"))
+    return out
 
 
 def fall_sentence(falls: Sequence[Fall]) -> str:

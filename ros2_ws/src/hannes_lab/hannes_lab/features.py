@@ -9,7 +9,7 @@ differ a little (an operator's amplitude), so do the closures: by how much is ta
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
@@ -392,13 +392,18 @@ def _block(
     )
 
 
+def _each(texts: Iterable[str]) -> str:
+    """Each text once, those that say nothing left out."""
+    return ", ".join(filter(None, dict.fromkeys(texts)))
+
+
 def data_used(features: Features) -> tuple[dict[str, Any], ...]:
     """What data took part: per trial its conditions, closures and signals, and of which bags, by their hash, it is."""
     return tuple(
         {
             "name": t.name,
-            "source": ", ".join(p.source for p in t.parts) or t.source,
-            "sha256": ", ".join(p.sha256 for p in t.parts) or t.sha256,
+            "source": _each([p.source for p in t.parts]) or t.source,
+            "sha256": _each([p.sha256 for p in t.parts]) or t.sha256,
             "conditions": list(t.conditions),
             "closures": len(t.closures),
             "signals": sorted(t.signals),

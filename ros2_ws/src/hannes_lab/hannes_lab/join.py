@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from hannes_sim.measurement import sample_noise
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
@@ -75,20 +76,37 @@ def join_repeats(loaded: Sequence[Loaded]) -> list[Trial]:
 def join_trials(trials: Sequence[Trial]) -> list[Trial]:
     """A rig's trials, joined as bags are: those that repeat a condition have its name in common."""
     joined = join_repeats([Loaded(trial, trial.conditions[0]) for trial in trials])
-    apart: dict[str, list[str]] = {}
+    apart: dict[str, list[Trial]] = {}
     for trial in joined:
         if len(trial.conditions) == 1 and len(trial.closures) < ENOUGH:
-            apart.setdefault(trial.conditions[0], []).append(trial.name)
+            apart.setdefault(trial.conditions[0], []).append(trial)
     said = [
-        f"{', '.join(names)} are of one condition, '{condition}', and are not taken together: their references or "
-        "signals differ, or it is not seen how each began; where each begins as the first does, their trials must say "
-        "so (fresh=True)"
-        for condition, names in apart.items()
-        if len(names) > 1
+        f"{', '.join(t.name for t in of_one)} are of one condition, '{condition}', and are not taken together: "
+        f"{_why_apart(*of_one[:2])}"
+        for condition, of_one in apart.items()
+        if len(of_one) > 1
     ]
     first, *others = joined
     told = tuple(OfAll(note) for note in said if note not in first.notes)
     return [replace(first, notes=(*first.notes, *told)), *others]
+
+
+def _why_apart(a: Trial, b: Trial) -> str:
+    """Why two recordings of one condition do not repeat each other."""
+    if set(a.signals) == set(b.signals):
+        far = {signal: _apart(a, b, signal) for signal in a.signals}
+        signal = max(far, key=lambda name: far[name])
+        if far[signal] > ALIKE:
+            return (
+                f"{signal} differs by {100 * far[signal]:.0f} % of its span, where repeats may by {100 * ALIKE:.0f} %; "
+                "name what differs as a condition of its own, or leave one out"
+            )
+    if a.fresh and b.fresh:
+        return "their references, signals, units or options differ"
+    return (
+        "their references or signals differ, or it is not seen how each began; where each begins as the first does, "
+        "their trials must say so (fresh=True)"
+    )
 
 
 def _one_or_all(group: list[Loaded], fresh: bool | None) -> list[Trial]:
@@ -168,7 +186,7 @@ def _repeats(one: Loaded, other: Loaded) -> bool:
     if said != (other.kind, b.period, b.units, set(b.signals), b.fresh) or not _same(*options):
         return False
     together = _joined([other, one])
-    return len(together.conditions) == 1 and all(_alike(a, b, signal) for signal in a.signals)
+    return len(together.conditions) == 1 and all(_apart(a, b, s) <= ALIKE for s in a.signals)
 
 
 def _same(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
@@ -176,13 +194,16 @@ def _same(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
 
 
-def _alike(a: Trial, b: Trial, signal: str) -> bool:
+def _apart(a: Trial, b: Trial, signal: str) -> float:
+    """Root mean square difference of two mean closures beyond the noise of their samples, in spans of the larger."""
     if _noise(a, signal) and _noise(b, signal):
-        return True
+        return 0.0
     length = min(c.stop - c.start for t in (a, b) for c in t.closures)
     curves = [t.mean_closure(signal, np.linspace(0.0, length, _GRID)) for t in (a, b)]
     span = max(float(np.ptp(curve)) for curve in curves)
-    return float(np.sqrt(np.mean((curves[0] - curves[1]) ** 2))) <= ALIKE * span
+    noise = sum(sample_noise(t.signals[signal][1]) ** 2 / len(t.closures) for t in (a, b))
+    beyond = float(np.mean((curves[0] - curves[1]) ** 2)) - noise
+    return max(beyond, 0.0) ** 0.5 / span if span > 0.0 else 0.0
 
 
 def _noise(trial: Trial, signal: str) -> bool:
@@ -212,6 +233,8 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
         signals[name] = np.concatenate(time), np.concatenate(values)
     step = max(one.step for one in group)
     names = [stem_of(t.source) if t.source else t.name for t in trials]
+    if len(set(names)) < len(names):  # several in one file
+        names = [t.name for t in trials]
     said = f"{len(trials)} recordings repeat one condition and are taken together ({', '.join(names)})"
     usual = float(np.median([c.stop - c.start for t in trials for c in t.closures]))
     if length < SHORT * usual:

@@ -19,6 +19,10 @@ TRANSIENT = 0.15
 """s after the start that the thesis' averages leave out (X18: the start-up transient of the current)."""
 
 
+STANDS = 1e-6
+"""Part of the whole reference's span that one which stands goes over at most."""
+
+
 def phase_of(
     trial: Trial, closure: Closure, phase: Array, contact: NDArray[np.bool_] | None
 ) -> NDArray[np.int64]:
@@ -41,6 +45,10 @@ def phase_of(
     span = max(high - low, 1e-12)
     steepest = float(np.abs(slope).max()) or 1.0
     out = np.full(phase.size, PHASES.index("rest"))
+    # A reference that stands all through is at rest where the others are lowest too; one that never moves is held.
+    whole = float(np.ptp(trial.reference))
+    if high - low <= STANDS * whole:
+        low = float(trial.reference.min()) - (0.0 if whole > 0.0 else span)
     away = reference - low > 0.02 * span
     moving = np.abs(slope) > 0.02 * steepest
     out[away & ~moving] = PHASES.index("hold")

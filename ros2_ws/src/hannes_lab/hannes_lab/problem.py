@@ -144,7 +144,7 @@ def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
         nuisance.sd,
         nuisance.log,
         nuisance.lower,
-        np.inf,
+        nuisance.upper,
         True,
         nuisance.step,
         nuisance.unit,

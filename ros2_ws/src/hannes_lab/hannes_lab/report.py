@@ -566,7 +566,7 @@ def dependences(comparison: Part | None, after: Part | None, diagnosis: Part | N
 def _ends(name: str, xs: Sequence[float], unit: str) -> list[str]:
     """What to write below a curve: its ends, or the groups' names."""
     if name == "direction":
-        return ["opening", "standing", "closing"]
+        return ["position falls", "stands", "rises"]
     if name == "time":
         return ["first closure", "last"]
     if not xs:

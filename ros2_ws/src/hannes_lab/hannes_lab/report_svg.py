@@ -208,7 +208,7 @@ def curve_svg(
     for k, (name, xs, ys) in enumerate(curves):
         points = [(a, b) for a, b in zip(xs, ys, strict=False) if a is not None and b is not None]
         if steps:
-            # One bar a direction: opening, standing, closing stand at thirds of the width.
+            # One bar a direction: down, standing, up stand at thirds of the width.
             for a, b in points:
                 third = 0 if a < -STANDING else 2 if a > STANDING else 1
                 at = width * (third + 0.5) / 3.0 + 12.0 * (k - (len(curves) - 1) / 2.0)

@@ -60,7 +60,7 @@ class Nuisance:
     log          positive parameter, treated on a logarithmic scale
     closure_sd   scatter from closure to closure, same scale as sd
     step         of finite differences, in sd: small where the prior is wide
-    lower        least value, for a positive parameter on a linear scale
+    lower, upper  least and largest value
     apart        sd that the one of a recording may be from the mean over all recordings; beyond, no set of effects is
                  adequate
     effect       effect of the catalogue that is the same thing, if there is one: a value that is far off is that effect
@@ -75,6 +75,7 @@ class Nuisance:
     unit: str = ""
     step: float = 0.5
     lower: float = -math.inf
+    upper: float = math.inf
     apart: float = math.inf
     effect: str = ""
     below: float = 0.0
@@ -243,7 +244,19 @@ class PlantRig:
                 f"{self.population}: there are no tolerances in it; give a line for each uncertain parameter, such as "
                 '`motor.kt: {sd: 0.03, closure_sd: 0.0, unit: "1", source: magnets}`.'
             )
-        return [self._nuisance(name, entry, model) for name, entry in table.items()]
+        return [self._within(self._nuisance(name, entry, model), model) for name, entry in table.items()]
+
+    def _within(self, nuisance: Nuisance, model: Model) -> Nuisance:
+        """The same, kept inside the bounds that the model's file gives its parameter."""
+        if nuisance.name not in model.names:
+            return nuisance
+        own = model.named(nuisance.name)
+        if own.lower >= own.upper:
+            raise HannesError(
+                f"{self.population}: '{nuisance.name}' has a tolerance, but its bounds hold it at {own.value:g} "
+                f"{own.unit}: take the line out, or give it lower and upper bounds."
+            )
+        return replace(nuisance, lower=max(nuisance.lower, own.lower), upper=min(nuisance.upper, own.upper))
 
     def _nuisance(self, name: str, entry: Mapping[str, Any], model: Model) -> Nuisance:
         try:

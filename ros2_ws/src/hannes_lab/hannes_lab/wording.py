@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from .adequacy import shortfall
 from .chance import Chance
-from .choose import Choice, halved, needed_gain
+from .choose import Choice, can_be_held_out, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
-from .falls import fall_sentence
+from .falls import WITHOUT_EFFECT, fall_sentence, relative_errors
 from .fit import Fit, fit
 from .problem import Coordinate, Problem, nuisance_coordinate
 from .report_text import EITHER
@@ -27,6 +28,9 @@ ANY_DIFFERENCE = (
 CLOCK_PART = 0.25
 """Part of the misfit that another clock of the reference must remove to be worth a note."""
 
+CLOCK_LEADS = 0.5
+"""Part from which it is said in the summary: what is left after that may need no effect."""
+
 CLOCK_STEPS = 6
 """Length of the fit that tells it."""
 
@@ -38,6 +42,9 @@ _NOT_OF_MACHINE = ("control", "log", "encoder", "object")
 
 UNUSUAL = 1.5
 """Standard deviations of a wide prior from which a parameter that stands for an effect is worth a note."""
+
+HELD = 0.01
+"""Standard deviations of its prior from a bound within which a parameter is held by it."""
 
 NAMED = 4
 """Effects that a sentence names; of more, it says how many."""
@@ -60,10 +67,12 @@ def summary(
     best: Candidate,
     bent: str = "",
     only: Sequence[str] = (),
+    clock: Clock | None = None,
 ) -> str:
     """The verdict in a sentence or two: what is missing, how the error falls, and what to be careful with.
 
     bent  why the set that chance explains is no answer, if it is none
+    clock what another clock of the reference would remove
     only  the effects that were looked for, where those are not the whole catalogue
     """
     fall = fall_sentence(falls)
@@ -96,7 +105,8 @@ def summary(
     beyond = (
         f"is not one of those that were looked for ({_listed(only)})" if only else "is not in the catalogue"
     )
-    return f"Something is missing that {beyond}: {why}.{part} {fall}"
+    first = f" First look at the clock: {clock.said}." if clock and clock.part >= CLOCK_LEADS else ""
+    return f"Something is missing that {beyond}: {why}.{first}{part} {fall}"
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -134,26 +144,33 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
 def worse_fitted(falls: Sequence[Fall]) -> tuple[str, ...]:
     """A sentence where the fit of the nominal model has a larger error than the nominal model itself."""
     given, fitted = falls[0].held_out, falls[1].held_out
+    said = f"{fitted:.2f}) than as given ({given:.2f} times the repeatability"
+    if not np.isfinite([given, fitted]).any():
+        given, fitted = relative_errors(falls)[:WITHOUT_EFFECT]
+        said = f"on conditions that were left out) than as given ({given:.2f} of the error"
+    if not fitted > given:
+        return ()
     return (
-        (
-            f"the nominal model is further off as fitted ({fitted:.2f}) than as given ({given:.2f} times the "
-            "repeatability): a fit weighs each sample by how well it is known and how far a model of this form may be "
-            "off, and pays for tolerances; these errors do not",
-        )
-        if fitted > given
-        else ()
+        f"the nominal model is further off as fitted ({said}): a fit weighs each sample by how well it is known and "
+        "how far a model of this form may be off, and pays for tolerances; these errors do not",
     )
 
 
 def notes(
-    search: Search, best: Candidate, verdict: str, experiments: Sequence[Experiment], greedy: bool
+    search: Search,
+    best: Candidate,
+    verdict: str,
+    effects: Sequence[FoundEffect],
+    experiments: Sequence[Experiment],
+    greedy: bool,
+    clock: Clock | None,
 ) -> tuple[str, ...]:
     """What else a user must know of an answer, a sentence each."""
     return (
         *_any_difference(search, verdict, greedy),
-        *(clock_note(search.problem, best.fit) if greedy or verdict == "unknown" else ()),
+        *((clock.said,) if clock else ()),
         *_inseparable(search, experiments),
-        *_ends(best),
+        *_ends(search, best, effects),
         *_undescribed(best),
         *_taken_for_its_own(search, best),
         *_identifiability(best),
@@ -269,14 +286,22 @@ def failure_notes(problem: Problem) -> list[str]:
     ]
 
 
-def clock_note(problem: Problem, found: Fit) -> list[str]:
+@dataclass(frozen=True)
+class Clock:
+    """Another clock of the reference: what part of the misfit it would remove, and a sentence on it."""
+
+    part: float
+    said: str
+
+
+def other_clock(problem: Problem, found: Fit) -> Clock | None:
     """Whether what is left looks as if the reference had been logged earlier or later, where that is not fitted yet.
 
     Only on machines of others, see Rig.foreign: a hand's recordings tell their clock, or it is fitted.
     """
     rig, fitted = problem.rig, {c.name for c in found.coordinates}
     if REFERENCE_DELAY in fitted or not rig.foreign or rig.approximate or found.cost <= 0.0:
-        return []
+        return None
     tick = min(trial.period for trial in problem.features.trials)
     clock = Nuisance(
         REFERENCE_DELAY, 0.0, REFERENCE_DELAY_SD, False, unit="s", step=0.5 * tick / REFERENCE_DELAY_SD
@@ -285,19 +310,20 @@ def clock_note(problem: Problem, found: Fit) -> list[str]:
     moved = fit(problem, found.model, coordinates, found.point, evaluations=CLOCK_STEPS)
     part, delay = 1.0 - moved.cost / found.cost, moved.values[REFERENCE_DELAY]
     if part < CLOCK_PART:
-        return []
-    return [
+        return None
+    return Clock(
+        part,
         f"what is left looks as if the signals were {'later' if delay > 0.0 else 'earlier'} than the reference's clock "
         f"says, by {1e3 * abs(delay):.2g} ms: that alone would remove {100.0 * part:.0f} % of the misfit; mend it "
-        f"where the recordings are read, or let it be fitted ({REFERENCE_DELAY} in an adapter's tolerances)"
-    ]
+        f"where the recordings are read, or let it be fitted ({REFERENCE_DELAY} in an adapter's tolerances)",
+    )
 
 
 def _any_difference(search: Search, verdict: str, greedy: bool) -> list[str]:
     """What else can be tried where chance does not explain what is left, and the model may be off by nothing."""
     problem = search.problem
     may = verdict == "unknown" and not greedy and not problem.discrepancy
-    return [ANY_DIFFERENCE] if may and len(problem.features.conditions) > 1 else []
+    return [ANY_DIFFERENCE] if may and can_be_held_out(problem.features) else []
 
 
 def _inseparable(search: Search, experiments: Sequence[Experiment]) -> list[str]:
@@ -313,13 +339,30 @@ def _inseparable(search: Search, experiments: Sequence[Experiment]) -> list[str]
     ]
 
 
-def _ends(best: Candidate) -> list[str]:
-    """The effects' parameters that the end of their range holds."""
-    return [
+def _ends(search: Search, best: Candidate, effects: Sequence[FoundEffect]) -> list[str]:
+    """The parameters that the end of their range holds, and the effects' of which the 95 % interval is cut there."""
+    out = [
         f"{c.name} lies at the end of its range ({c.lower:g} to {c.upper:g} {c.unit}): the true value may lie beyond "
         "it, or it is another effect of a similar form"
         for c in best.fit.at_end
     ]
+    known = {c.name: c for c in best.fit.coordinates}
+    wider = ", or the adapter's `sizes` are too small" if getattr(search.problem.rig, "sizes", None) else ""
+    for effect in effects:
+        for name, p in effect.parameters.items():
+            c = known[f"{effect.name}.{name}"]
+            if p.identified and any(c.at_end(c.z(end)) for end in (p.low, p.high)):
+                out.append(
+                    f"the 95 % interval of {c.name} ({p.low:.3g} .. {p.high:.3g} {c.unit}) is cut at the end of its "
+                    f"range ({c.lower:g} to {c.upper:g}): the true value may lie beyond it{wider}"
+                )
+    out += [
+        f"the fit holds {c.name} at {c.value(float(z)):.4g} {c.unit}, the end of its range in the model's file "
+        f"({c.lower:g} to {c.upper:g}): is that range right, or is there an effect of the same form?"
+        for c, z in zip(best.fit.coordinates, best.fit.z, strict=True)
+        if c.nuisance and c.name in search.model.names and any(abs(z - end) < HELD for end in c.bounds)
+    ]
+    return out
 
 
 def _undescribed(best: Candidate) -> list[str]:
