@@ -35,7 +35,6 @@ from .ports import (
     P_RESOLUTION,
     P_SUPPLY,
     P_ZERO,
-    QL,
     R_CURRENT,
     R_EFFORT,
     R_POSITION,
@@ -57,7 +56,6 @@ from .ports import (
     SUPPLY,
     VOLTAGE,
     VOLTAGE_DROP,
-    Q,
     T,
     V,
 )  # fmt: skip
@@ -66,12 +64,9 @@ FASTEST = 1e4
 """rad/s or m/s; a machine that is faster has diverged, whatever its effects give."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def evaluate_effects(handle):  # type: ignore[no-untyped-def]
-    """Sum the contributions of all active effects into the outputs; the inputs must be filled before.
-
-    One that is not finite where the machine still is, is kept in mind: a limiter may take it for a number.
-    """
+    """Sum the contributions of all active effects into the outputs; the inputs must be filled before."""
     x, y = handle[H_INPUTS], handle[H_OUTPUTS]
     out = pointer_f8(y)
     for k in range(N_OUTPUTS):
@@ -79,17 +74,24 @@ def evaluate_effects(handle):  # type: ignore[no-untyped-def]
     table = pointer_i8(handle[H_EFFECTS])
     for k in range(table[0]):
         call_effect(table[1 + 3 * k], x, table[2 + 3 * k], table[3 + 3 * k], y)
-    if table[0] > 0:
-        total = 0.0
-        for k in range(N_OUTPUTS):
-            total += out[k]
-        if not math.isfinite(total):
-            given = pointer_f8(x)
-            if math.isfinite(given[Q] + given[QL]) and abs(given[V]) < FASTEST:
-                pointer_f8(handle[H_STATE])[S_UNDEFINED] = 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
+def watch_outputs(handle, place, speed):  # type: ignore[no-untyped-def]
+    """Keep in mind that what the effects gave last is not finite, though the machine was: a limiter may hide it.
+
+    place, speed   of the machine before they gave it
+    """
+    if pointer_i8(handle[H_EFFECTS])[0] == 0:
+        return
+    out, total = pointer_f8(handle[H_OUTPUTS]), 0.0
+    for k in range(N_OUTPUTS):
+        total += out[k]
+    if not math.isfinite(total) and math.isfinite(place) and abs(speed) < FASTEST:
+        pointer_f8(handle[H_STATE])[S_UNDEFINED] = 1.0
+
+
+@njit(cache=True, error_model="numpy")
 def begin_step(handle, voltage, q, v):  # type: ignore[no-untyped-def]
     """Time, delayed and limited command, and motor position into the inputs; returns nothing.
 
@@ -121,7 +123,7 @@ def begin_step(handle, voltage, q, v):  # type: ignore[no-untyped-def]
     x[SUPPLY] = limit
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def motor_torque(handle):  # type: ignore[no-untyped-def]
     """Torque at the pulley [N.m] of the brushed motor after this step.
 
@@ -161,7 +163,7 @@ def motor_torque(handle):  # type: ignore[no-untyped-def]
     return p[P_EFFICIENCY] * kt * p[P_RATIO] * mean
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def sense(handle, q, steps):  # type: ignore[no-untyped-def]
     """Fill time, encoder, current and effort of the reading after `steps` steps."""
     p, s = pointer_f8(handle[H_PARAMETERS]), pointer_f8(handle[H_STATE])
@@ -178,7 +180,7 @@ def sense(handle, q, steps):  # type: ignore[no-untyped-def]
     s[S_POSITION_READ] = position
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def dry_friction(momentum, impulse, mobility):  # type: ignore[no-untyped-def]
     """Velocity after an implicit dry-friction impulse: sticks exactly, never reverses the motion.
 

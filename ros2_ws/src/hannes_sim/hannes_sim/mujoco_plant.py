@@ -47,7 +47,7 @@ from numba import cfunc
 from numpy.typing import NDArray
 
 from .effect import BoundEffects
-from .motor import FASTEST, begin_step, evaluate_effects, motor_torque, sense
+from .motor import FASTEST, begin_step, evaluate_effects, motor_torque, sense, watch_outputs
 from .native import ADVANCE_SIGNATURE, call_2, pointer_f8, pointer_i8
 from .objects import GraspObject
 from .plant import DEFAULT_DT, NOT_NEGATIVE, POSITIVE, PlantDiverged, Reading
@@ -187,6 +187,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
         begin_step(handle, voltage, q, v)
         x[QL], x[VL], x[LOAD], x[CONTACT] = ql, vl, s[S_LOAD], s[S_CONTACT]
         evaluate_effects(handle)
+        watch_outputs(handle, q + ql, v)
         torque = motor_torque(handle) + y[TORQUE]
         level = max(0.0, p[_COULOMB] + y[FRICTION]) / r
         viscous = max(0.0, p[_VISCOUS] + y[DAMPING]) / (r * r)

@@ -26,7 +26,7 @@ from numba import cfunc
 from numpy.typing import NDArray
 
 from .effect import BoundEffects
-from .motor import begin_step, dry_friction, evaluate_effects, motor_torque, sense
+from .motor import begin_step, dry_friction, evaluate_effects, motor_torque, sense, watch_outputs
 from .native import ADVANCE_SIGNATURE, pointer_f8
 from .objects import GraspObject
 from .plant import DEFAULT_DT, NOT_NEGATIVE, POSITIVE, PlantDiverged, Reading
@@ -124,7 +124,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
     x, y, out = pointer_f8(handle[H_INPUTS]), pointer_f8(handle[H_OUTPUTS]), pointer_f8(handle[H_READING])
     dt = p[P_DT]
     q, v, ql, vl = s[_SQ], s[_SV], s[_SQL], s[_SVL]
-    load, contact = s[S_LOAD], s[S_CONTACT]
+    place, speed, load, contact = q + ql, v, s[S_LOAD], s[S_CONTACT]
     for _ in range(steps):
         begin_step(handle, voltage, q, v)
         x[QL], x[VL], x[LOAD], x[CONTACT] = ql, vl, load, contact
@@ -169,6 +169,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
         s[S_TIME_STEPS] += 1.0
     s[_SQ], s[_SV], s[_SQL], s[_SVL] = q, v, ql, vl
     s[S_LOAD], s[S_CONTACT] = load, contact
+    watch_outputs(handle, place, speed)  # once a control period: what an effect cannot give lasts
     sense(handle, q, steps)
     out[R_FORCE] = contact / p[_TIP] if p[_TIP] > 0.0 else 0.0
     out[R_Q], out[R_QL], out[R_LOAD] = q, ql, load
@@ -177,7 +178,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
         out[R_WARNING] = UNDEFINED
 
 
-_compiled = cfunc(ADVANCE_SIGNATURE, cache=True)(_advance)
+_compiled = cfunc(ADVANCE_SIGNATURE, cache=True, error_model="numpy")(_advance)
 
 # Finger joints of the closed hand; the long fingers' abduction is passive and stays in the middle.
 _CLOSED = np.array(
