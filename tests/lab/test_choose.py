@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from hannes_lab import choose as module
 from hannes_lab.chance import Chance
-from hannes_lab.choose import OWN_ERROR_PART, choose, choose_greedily
+from hannes_lab.choose import OWN_ERROR_PART, Choice, choose, choose_greedily
+from hannes_lab.diagnose import _behind_the_law
 from hannes_lab.search import PENALTY, Candidate
 from hannes_lab.wording import nearest_sentence
 
@@ -119,6 +120,28 @@ def test_the_form_of_another_machine_is_no_effect(given: pytest.MonkeyPatch) -> 
         first = made(("a",), 100.0 - gain, 1.0)
         given.setattr(module, "_extended", lambda *a, first=first: [first])
         assert choose(search_of(small, first), small, LIMITS, 1).best.names == names
+
+
+@pytest.mark.parametrize(("gain", "named"), [(0.15, True), (0.05, False)], ids=["enough", "too little"])
+def test_what_another_machines_law_had_hidden_is_looked_for(
+    given: pytest.MonkeyPatch, gain: float, named: bool
+) -> None:
+    """The law gains more than what is hidden beside it; only where that gains enough by itself a search is made."""
+    law, other = made(("a",), 700.0, 5.0), made(("b",), (1.0 - gain) * 1000.0, 5.0)
+    tried: list[list[str]] = []
+
+    def extended(choice: Choice, front: Sequence[Candidate], *rest: Any) -> list[Candidate]:
+        tried.append(choice.sought)
+        return [c for c in (law, other) if set(c.names) <= set(choice.sought)] if front == [NULL] else []
+
+    given.setattr(module, "_extended", extended)
+    given.setattr("hannes_lab.diagnose.is_adequate", lambda s, c, limits, room=1.0: True)
+    search = search_of(NULL, law, other)
+    found = _behind_the_law(search, NULL, LIMITS, 2, "a")
+    assert (found is not None) == named and ("a" not in tried[0] if named else not tried)
+    assert found is None or (found.best.names == ("b",) and found.rivals == ())
+    alike = choose(search_of(NULL, law, other), NULL, LIMITS, 1)
+    assert alike.best.names == ("a",)
 
 
 def test_what_was_asked_of_the_nearest_effect_is_said(given: pytest.MonkeyPatch) -> None:

@@ -79,6 +79,7 @@ class Choice:
     idle     where no effect is named: a sentence on those that fit better, but foretell no better what took no part in
              the fit
     left     a sentence on what a greedy choice leaves, where something is
+    excluded effects that are not looked for
     """
 
     search: Search
@@ -91,10 +92,18 @@ class Choice:
     enough: bool = False
     idle: str = ""
     left: str = ""
+    excluded: tuple[str, ...] = ()
+
+    @property
+    def sought(self) -> list[str]:
+        """The effects that are looked for."""
+        return [name for name in self.search.sources if name not in self.excluded]
 
 
-def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) -> Choice:
-    """Smallest adequate set of effects.
+def choose(
+    search: Search, null: Candidate, limits: Chance, max_effects: int, excluded: tuple[str, ...] = ()
+) -> Choice:
+    """Smallest adequate set of effects, of which none is `excluded`.
 
     Sets of one, two and three effects in turn; each round extends the best of the round before by every effect, so that
     two effects of which neither is best alone are found too.  After each round noise, scatter and critical values are
@@ -102,7 +111,7 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
     only sets that are as good as the best within chance are extended.  A set of which an effect must be bent into
     another form counts only where there is no other.
     """
-    choice = Choice(search, null, limits, is_adequate(search, null, limits), ())
+    choice = Choice(search, null, limits, is_adequate(search, null, limits), (), excluded=excluded)
     front, far = [null], list[Candidate]()
     for size in range(1, max_effects + 1):
         enough = is_adequate(choice.search, choice.best, choice.limits, room=1.0)
@@ -116,7 +125,7 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
         if not round_:
             break
         if first_one and _hard(choice, round_[0]):
-            again = search.thoroughly().extend(front, list(search.sources), "one effect, thoroughly", worth)
+            again = search.thoroughly().extend(front, choice.sought, "one effect, thoroughly", worth)
             round_ = _best_of(round_, again)
         round_ = [c for c in round_ if not distorted(choice.search, c)] or round_
         if enough and round_[0].penalised < worth and set(choice.best.names) < set(round_[0].names):
@@ -156,7 +165,7 @@ def choose(search: Search, null: Candidate, limits: Chance, max_effects: int) ->
         close = tuple(c for c in near[1:] if c.penalised <= best.penalised + tie_width(new, best))
         adequate = is_adequate(new, best, limits_new)
         left = 1.0 - _share(choice.best, round_[0], choice.limits.median)
-        choice = Choice(new, best, limits_new, adequate, ranking, close)
+        choice = Choice(new, best, limits_new, adequate, ranking, close, excluded=excluded)
         if 1 < size < max_effects and left > LEFT_MOST and best.fit.cost > FAR_OFF * limits_new.misfit:
             choice = replace(choice, notes=(_ended_early(size, left, best, limits_new),))
             break
@@ -307,6 +316,7 @@ def cut_to(choice: Choice, part: Candidate) -> Choice:
         c
         for names, c in search.found.items()
         if len(names) == len(part.names)
+        and not set(names) & set(choice.excluded)
         and set(names) != set(part.names)
         and c.penalised <= part.penalised + tie_width(search, part)
         and is_adequate(search, c, choice.limits)
@@ -323,7 +333,7 @@ def _extended(
     Where the best set holds a smaller one that was not extended, that is extended too: the other effect of a pair may
     be the right one though it was not among the best alone.
     """
-    search, names = choice.search, list(choice.search.sources)
+    search, names = choice.search, choice.sought
     alike = front[0].penalised + tie_width(search, front[0])
     explained = is_adequate(search, front[0], choice.limits, room=1.0)
     first = [c for c in front if explained or c.penalised <= alike]

@@ -26,6 +26,7 @@ from .choose import (
     cut_to,
     judged_by_conditions,
     must_be_held_out,
+    needed_gain,
     tied_sets,
 )
 from .depends import residual_dependences
@@ -38,7 +39,7 @@ from .features import data_used
 from .fit import Fit
 from .prepare import Prepared
 from .screen import usable_effects
-from .search import FAR, Candidate, Progress, Search, silent
+from .search import FAR, PENALTY, Candidate, Progress, Search, silent
 from .wording import (
     bent_sentence,
     idle_sentence,
@@ -204,6 +205,11 @@ def _answer(prepared: Prepared, search: Search, max_effects: int, greedy: bool) 
         if (fewer := without_law(choice)) is not choice:
             effect, how = in_the_law(choice.search, choice.best)
             with_it, choice, falls = falls[-1], fewer, falls_of(fewer, search)
+            other = _behind_the_law(search, null, limits, max_effects, effect)
+            if other is not None:
+                behind = falls_of(other, search)
+                if _foretells((*falls, with_it, behind[-1])):
+                    choice, falls = other, behind
             said = law_sentence(effect, how, with_it.held_out, min(fall.held_out for fall in falls))
             choice = _with_unnamed(choice, said)
         choice, falls = without_idle(choice, falls)
@@ -212,6 +218,24 @@ def _answer(prepared: Prepared, search: Search, max_effects: int, greedy: bool) 
             choice, null, falls = instead, first.null(), falls_of(instead, first)
         bent = bent_sentence(choice, falls)
     return _Answer(null, choice, falls, bent, holds and not bent)
+
+
+def _behind_the_law(
+    search: Search, null: Candidate, limits: Chance, max_effects: int, law: str
+) -> Choice | None:
+    """What is chosen without an effect that is no more than another machine's law, if a single one gains enough.
+
+    The law is in every recording, may gain more than what is hidden beside it, and takes its place.
+    """
+    bare = Choice(search, null, limits, is_adequate(search, null, limits), ())
+    singles = [c for key, c in search.found.items() if len(key) == 1 and law not in key]
+    gains = [
+        null.penalised + PENALTY - c.penalised >= needed_gain(bare, null, c, first=True) for c in singles
+    ]
+    if not any(gains):
+        return None
+    other = choose(search, null, limits, max_effects, (law,))
+    return other if other.adequate and other.best.names else None
 
 
 def _borne_out(choice: Choice, null: Candidate, falls: tuple[Fall, ...]) -> tuple[Choice, tuple[Fall, ...]]:
