@@ -426,6 +426,8 @@ def test_a_fit_stays_inside_the_bounds_of_the_parameters_file(tmp_path: Path) ->
         parameters.read_text().replace("lower: 0.5, upper: 10.0", "lower: 1.9, upper: 10.0")
     )
     weighed = Model.load(tmp_path / "mass.yaml")
+    told = compare(prepare(rig.read([path]), weighed, rig=rig), fitted=True).notes
+    assert any("the fit holds motor.armature at 1.9 kg" in note for note in told)
     held = diagnose(prepare(rig.read([path]), weighed, rig=rig), effect_sources(only=["coulomb_friction"]))
     assert held.values["motor.armature"] >= 1.9 and held.verdict != "nothing"
     assert held.model.parameters["motor.armature"].lower == 1.9

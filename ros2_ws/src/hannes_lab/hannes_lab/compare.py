@@ -20,7 +20,7 @@ from .features import Block, Features, data_used
 from .phases import METRICS, PHASES, metrics, phase_of
 from .prepare import FEW, Prepared
 from .search import Progress, Search, silent
-from .wording import other_clock
+from .wording import held_notes, other_clock
 
 Array = NDArray[np.float64]
 
@@ -181,7 +181,7 @@ def compare(
             )
             found = search.null().fit
             values, clock = found.values, other_clock(prepared.problem, found)
-            own = [clock.said] if clock else []
+            own = [*([clock.said] if clock else []), *held_notes(found)]
     predicted = features.closures(prepared.rig, model, values)
     contact = _contact(prepared, values)
     labels = [_labels(features, block, contact) for block in features.blocks]

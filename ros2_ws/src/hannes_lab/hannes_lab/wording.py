@@ -356,13 +356,17 @@ def _ends(search: Search, best: Candidate, effects: Sequence[FoundEffect]) -> li
                     f"the 95 % interval of {c.name} ({p.low:.3g} .. {p.high:.3g} {c.unit}) is cut at the end of its "
                     f"range ({c.lower:g} to {c.upper:g}): the true value may lie beyond it{wider}"
                 )
-    out += [
+    return out + held_notes(best.fit)
+
+
+def held_notes(found: Fit) -> list[str]:
+    """The parameters of the model's file that the end of their range holds."""
+    return [
         f"the fit holds {c.name} at {c.value(float(z)):.4g} {c.unit}, the end of its range in the model's file "
         f"({c.lower:g} to {c.upper:g}): is that range right, or is there an effect of the same form?"
-        for c, z in zip(best.fit.coordinates, best.fit.z, strict=True)
-        if c.nuisance and c.name in search.model.names and any(abs(z - end) < HELD for end in c.bounds)
+        for c, z in zip(found.coordinates, found.z, strict=True)
+        if c.nuisance and c.name in found.model.names and any(abs(z - end) < HELD for end in c.bounds)
     ]
-    return out
 
 
 def _undescribed(best: Candidate) -> list[str]:
