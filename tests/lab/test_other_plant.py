@@ -34,6 +34,11 @@ def diagnosed(*effects: str) -> Diagnosis:
     prepared = prepare([make_trial(recording) for recording in made], Model.load())
     assert "wire.stiffness" in [n.name for n in prepared.nuisances]
     assert prepared.problem.discrepancy
+    (said,) = (note for note in prepared.notes if "made them" in note)
+    assert (
+        "plant 'mujoco' made them, and model 'nominal' has 'reduced'" in said
+        and "--model nominal_mujoco" in said
+    )
     return diagnose(prepared, effect_sources(only=FEW), max_effects=1)
 
 
@@ -175,5 +180,5 @@ def test_a_voltage_that_was_averaged_is_seen_to_be(window: float) -> None:
 def test_to_its_own_plant_a_model_has_no_error_of_its_own() -> None:
     made, _ = make_set(Model.load(), [], seed=23, closures=5, conditions=("slow",))
     prepared = prepare([make_trial(recording) for recording in made], Model.load())
-    assert not prepared.problem.discrepancy
+    assert not prepared.problem.discrepancy and not any("made them" in note for note in prepared.notes)
     assert "wire.stiffness" not in [n.name for n in prepared.nuisances]

@@ -187,6 +187,23 @@ def is_of(trial: Trial, model: Model) -> bool:
     return is_described(trial) and trial.options.get("plant") == model.plant
 
 
+MODEL_OF = {"reduced": "nominal", "mujoco": "nominal_mujoco"}
+"""The plant that a recording names, and the model that has it."""
+
+
+def other_plant(trials: Sequence[Trial], model: Model) -> list[str]:
+    """A sentence where this project's other plant made the recordings: its parameters are not felt alike."""
+    made = {
+        str(trial.options["plant"]) for trial in trials if is_described(trial) and "plant" in trial.options
+    }
+    return [
+        f"the recordings say that plant '{plant}' made them, and model '{model.name}' has '{model.plant}': the two are "
+        "not of one form (the full hand's spring is felt softer at the pulley than the reduced hand's), so they are "
+        f"treated as another machine's; --model {MODEL_OF[plant]} compares like with like"
+        for plant in sorted(made & MODEL_OF.keys() - {model.plant})
+    ]
+
+
 BOUNCE = 0.1
 """s within which an encoder that bounced at the open stop of its hand is back where it rests."""
 SETTLED = 0.2

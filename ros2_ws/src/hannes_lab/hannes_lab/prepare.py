@@ -21,7 +21,7 @@ from .blocks import in_blocks, told_apart
 from .features import Features, build_features
 from .fit import fit
 from .grasp import with_seen_objects
-from .hand import HandRig
+from .hand import HandRig, other_plant
 from .join import Loaded, join_repeats, join_trials
 from .lags import with_one_clock
 from .own_law import check_own_code
@@ -206,7 +206,7 @@ def prepare(
     # Near is enough for the noise; the search fits the model as it is again, to the end.
     settled, found = settle(problem, found, moves=3)
     problem = build_problem(settled.rig, features, model, nuisances, found.values, problem.counts)
-    notes = notes_of(trials)
+    notes = notes_of(trials) + ([] if strange else other_plant(trials, model))
     if strange:
         notes += told + other_units(rig, model, features)
         if model.base == Model.base:
