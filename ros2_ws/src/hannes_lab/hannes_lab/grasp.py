@@ -110,8 +110,8 @@ def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
             else "that something was grasped, its stiffness and place are"
         )
         note = (
-            f"{said} read from the closures (about {grasp.stiffness:.2g} N/m from {place:.1f} rad on) and fitted; say "
-            f"--object {trial.name}=none if nothing was"
+            f"{said} read from the closures (about {grasp.stiffness:.2g} N/m with the wire, from {place:.1f} rad on) "
+            f"and fitted; say --object {trial.name}=none if nothing was"
         )
         out.append(replace(_with_object(trial, grasp), notes=(*trial.notes, note)))
     return out
