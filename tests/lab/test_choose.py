@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hannes_lab import choose as module
 from hannes_lab.chance import Chance
-from hannes_lab.choose import OWN_ERROR_PART, Choice, choose, choose_greedily
+from hannes_lab.choose import OWN_ERROR_PART, Choice, _hard, choose, choose_greedily
 from hannes_lab.diagnose import _behind_the_law
 from hannes_lab.search import PENALTY, Candidate
 from hannes_lab.wording import nearest_sentence
@@ -142,6 +142,23 @@ def test_what_another_machines_law_had_hidden_is_looked_for(
     assert found is None or (found.best.names == ("b",) and found.rivals == ())
     alike = choose(search_of(NULL, law, other), NULL, LIMITS, 1)
     assert alike.best.names == ("a",)
+
+
+def test_a_machine_far_off_is_looked_at_thoroughly_though_it_explains_all(given: pytest.MonkeyPatch) -> None:
+    def made_at(cost: float, **flags: bool) -> Any:
+        return SimpleNamespace(fit=SimpleNamespace(cost=cost), names=(), **flags)
+
+    def hard(cost: float, other: bool = True, slow: bool = False, **flags: bool) -> bool:
+        flags = {"far_off": False, "pulled": False, **flags}
+        search: Any = SimpleNamespace(slow=slow, problem=SimpleNamespace(discrepancy=other))
+        choice = Choice(search, made_at(cost, **flags), LIMITS, cost <= LIMITS.misfit, ())
+        return _hard(choice, made_at(2000.0))
+
+    assert hard(900.0, far_off=True) and not hard(900.0)
+    assert not hard(900.0, far_off=True, slow=True)
+    assert not hard(900.0, other=False, far_off=True, pulled=True), "chance explains all there"
+    assert hard(2000.0, pulled=True) and not hard(2000.0, far_off=True)
+    assert hard(2000.0, other=False, pulled=True) and not hard(2000.0, other=False)
 
 
 def test_what_was_asked_of_the_nearest_effect_is_said(given: pytest.MonkeyPatch) -> None:

@@ -4,10 +4,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 from hannes_description.model import Model
+from hannes_lab.diagnose import effect_sources
 from hannes_lab.fit import Fit
-from hannes_lab.scan import _distinct
-from hannes_lab.search import Candidate, Search
+from hannes_lab.hide import make_set
+from hannes_lab.prepare import prepare
+from hannes_lab.scan import _distinct, _Place, _strengths
+from hannes_lab.search import FAR, Candidate, Search
+from hannes_lab.trials import make_trial
+from hannes_sim.effect import load_effect
 
 
 def test_of_points_of_one_period_the_best_stays_in_its_place() -> None:
@@ -28,3 +34,32 @@ def test_what_can_no_longer_tie_is_not_polished() -> None:
     assert Search._rivals(search, whole, 100.0) == 100.0
     assert Search._rivals(search, whole[1:], 1e6) == 1e6, "nothing explains all: whatever may help is tried"
     assert Search._rivals(search, [], 1e6) == 1e6
+
+
+def test_what_a_parameter_took_over_is_tried_in_its_effects_place() -> None:
+    """The joints' friction is the hand's own: 0.006 N.m more take it far off, and the hand sticks."""
+    hidden = load_effect("joint_friction").entry({"level": 0.006})
+    made, _ = make_set(Model.load(), [hidden], seed=31, closures=5, conditions=("fast", "grasp_fast"))
+    prepared = prepare([make_trial(one) for one in made], Model.load())
+    sources = effect_sources(only=["joint_friction", "viscous_friction"], model=prepared.model)
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, sources)
+    null = search.null()
+    z = null.fit.z_of("hand.coulomb")
+    assert z is not None and z > FAR and null.far_off
+
+    def swaps(name: str) -> list[Any]:
+        kind, (model, coordinates) = search.effect(name), search.with_effects((name,))
+        place = _Place(search.scan, kind, null.fit, model, coordinates)
+        (strength,) = _strengths(kind)
+        return place.swapped({}, strength)
+
+    ((cost, start),) = swaps("joint_friction")
+    more = null.fit.values["hand.coulomb"] - prepared.model.parameters.value("hand.coulomb")
+    _, coordinates = search.with_effects(("joint_friction",))
+    own = next(c for c in coordinates if c.name == "joint_friction.level")
+    assert start["hand.coulomb"] == 0.0 and own.value(start[own.name]) == pytest.approx(more)
+    assert cost == pytest.approx(null.fit.cost - z**2, rel=1e-3), "the misfit stays, the prior's charge goes"
+    assert swaps("viscous_friction") == [], "it has another unit"
+    found = search.extend([null], list(sources), "one")
+    assert found[0].names == ("joint_friction",) and not found[0].far_off
+    assert found[0].fit.values["joint_friction.level"] == pytest.approx(0.006, rel=0.3)

@@ -235,11 +235,14 @@ def halved(first: float, last: float) -> bool:
 def _hard(choice: Choice, first: Candidate) -> bool:
     """Whether effects must be tried thoroughly: the model as it is went far off, and no effect explains enough.
 
-    Where the model has an error of its own, much is explained by what is wrong: then always, unless nothing is missing.
+    Where the model has an error of its own, much is explained by what is wrong, and a machine that is far off may
+    explain all: then always.
     """
-    if choice.search.slow or not choice.best.pulled or choice.adequate:
+    if choice.search.slow:
         return False
-    return bool(choice.search.problem.discrepancy) or not is_adequate(choice.search, first, choice.limits)
+    if choice.search.problem.discrepancy:
+        return choice.best.far_off if choice.adequate else choice.best.pulled
+    return choice.best.pulled and not (choice.adequate or is_adequate(choice.search, first, choice.limits))
 
 
 def _ended_early(size: int, left: float, best: Candidate, limits: Chance) -> str:

@@ -50,6 +50,11 @@ a wave more or less within the travel."""
 NEAR = 2.0
 """A base whose nuisance parameters are all within so many standard deviations is scanned from where it is alone."""
 
+SMALL = 0.05
+SAME = 0.02
+"""Where so small a part of what a parameter is off, as a strength of an effect, changes the same but for this part, the
+two are taken to be one thing."""
+
 REACH = 8.0
 """Standard deviations to which a scan moves a nuisance parameter, unless the base is farther off already."""
 
@@ -154,6 +159,7 @@ class _Place:
     ) -> Iterator[Scored]:
         """All points of the scan; finely around the best one where that is a stray, if this is the last place."""
         scores, follow = [], []
+        swaps = [swap for name in strengths for swap in self.swapped(shapes[0], name)]
         for shape in shapes:
             for name, z in ((name, z) for name, points in strengths.items() for z in points):
                 start = {**shape, name: z}
@@ -166,7 +172,7 @@ class _Place:
                 if FOLLOWED[0] < best / z < FOLLOWED[1] and low <= best <= high:
                     follow.append((cost, {**start, name: best}))
         scores += [self.score(start) for _, start in sorted(follow, key=lambda item: item[0])[:FOLLOW]]
-        yield from scores
+        yield from (*scores, *swaps)
         if len(strengths) > 1:
             # The halves of a difference are right together only.
             yield from (self.score(self.joint(shape)) for shape in shapes)
@@ -206,6 +212,31 @@ class _Place:
                 bounds[k] = max(-reach, bounds[k, 0]), min(reach, bounds[k, 1])
         moved = np.clip(z, bounds[:, 0], bounds[:, 1])
         return cost, {**replace(place, z=moved).point, **start}
+
+    def swapped(self, shape: Point, name: str) -> list[Scored]:
+        """Starts with the strength in the place of a parameter that is off and the same thing, that one at its nominal.
+
+        Then the misfit stays, and what the prior charged is gained.  A scan does not see it where a large strength does
+        something else (the hand sticks) until the parameter has gone back.  The same thing has the same unit, and as
+        much of either changes the same.
+        """
+        place, own = self.place, self.own[name]
+        out = []
+        for c, z in zip(place.coordinates, place.z, strict=True):
+            more = c.value(float(z)) - c.value(0.0)
+            if not (c.nuisance and c.unit == own.unit and abs(z) > NEAR and own.lower <= more <= own.upper):
+                continue
+            little = c.value(float(z)) + SMALL * more
+            theirs = self.at({**shape, c.name: c.z(little)}) - place.residual
+            ours = self.at({**shape, name: own.z(own.value(0.0) + SMALL * more)}) - place.residual
+            apart, size = float(np.linalg.norm(ours - theirs)), float(np.linalg.norm(theirs))
+            if size == 0.0 or apart > SAME * size:
+                continue
+            start = {**self.here, **shape, c.name: 0.0, name: own.z(own.value(0.0) + more)}
+            residual = self.at(start)
+            charged = sum(start[other.name] ** 2 for other in place.coordinates if other.prior)
+            out.append((float(residual @ residual) + charged, start))
+        return out
 
     def followed(self, derivative: Array) -> tuple[float, float]:
         """Least cost along one more direction, with the place's coordinates compensating, and how far along it."""

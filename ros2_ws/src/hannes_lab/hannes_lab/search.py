@@ -71,6 +71,9 @@ class Candidate:
 REFIT = 8
 """Extensions of a round that are fitted in closed loop to the end."""
 
+BACK = 3
+"""Extensions beside those of a base that is far off which are carried on because they leave no parameter far off."""
+
 SHORT = 4
 MIDDLE = 5
 LONG = 10
@@ -561,9 +564,10 @@ class Search:
         ranked = self.polished(ranked, worthy, text)
         if not self.slow and ranked and (ranked[0].far_off or ranked[0].penalised >= worth):
             done |= {c.key for c in worthy}
-            rest = [c for c in ranked[:REFIT] if c.far_off and c.key not in done]
-            bent = [c for c in rest if self._led_astray(todo[c.key][0])]
-            ranked = self.polished(ranked, bent, text)
+            astray = {c.key for c in ranked if c.key not in done and self._led_astray(todo[c.key][0])}
+            bent = [c for c in ranked[:REFIT] if c.far_off and c.key in astray]
+            back = [c for c in ranked if not c.far_off and c.key in astray][:BACK]
+            ranked = self.polished(ranked, [*bent, *back], text)
         return ranked
 
     def _rivals(self, ranked: Sequence[Candidate], worth: float) -> float:
@@ -601,10 +605,13 @@ class Search:
         items = [(*item, fits) for item, fits in zip(chosen, found, strict=True)]
         items.sort(key=lambda item: item[3][0].cost)
         if not self.slow:
+            # What leaves a base that is far off for a machine within its tolerances is dearer until it has arrived.
+            back = [item for item in items[REFIT:] if item[0].far_off and farthest(item[3][0]) <= FAR][:BACK]
+            chosen_ones = [*items[:REFIT], *back]
             done = self.each(
-                Search._settled, [(*item, worth, short) for item in items[:REFIT]], f"{text}: refit"
+                Search._settled, [(*item, worth, short) for item in chosen_ones], f"{text}: refit"
             )
-            rest = items[REFIT:]
+            rest = [item for item in items[REFIT:] if not any(item is one for one in back)]
             ended = [_candidate((*b.names, n), replace(fits[0], complete=False)) for b, n, _, fits in rest]
             return [], [*done, *ended]
         # A further effect that gains nothing where its fit ends is near to where it would settle.
@@ -654,7 +661,7 @@ class Search:
         Of a base that is far off a scan says little.
         """
         if not self.slow:
-            return rank < REFIT or base.pulled
+            return rank < REFIT or (base.pulled if base.names else base.far_off)
         promising = base.pulled or (scanned < worth and scanned <= HOPELESS * least)
         return (rank < REFIT and promising) or (rank == 0 and not base.names)
 
