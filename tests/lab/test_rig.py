@@ -368,30 +368,30 @@ def test_an_effect_that_the_data_leave_open_must_take_half_of_the_error(
     assert any("for the data leave cogging.period open" in note for note in cut.notes)
 
 
-def test_an_effect_that_may_be_nought_at_the_end_is_left_out(
-    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    only = effect_sources(only=["coulomb_friction", "cogging"])
+@pytest.fixture
+def cogging_may_be_nought(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of data that leave its strength open."""
     monkeypatch.setattr(
         "hannes_lab.diagnose._may_be_nought", lambda search, found, limits: found.names[-1] == "cogging"
     )
-    found = diagnose(prepared, only)
+
+
+@pytest.mark.usefixtures("cogging_may_be_nought")
+def test_an_effect_that_may_be_nought_at_the_end_is_left_out(prepared: Prepared) -> None:
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]))
     assert [effect.name for effect in found.effects] == ["coulomb_friction"] and found.verdict == "effects"
     assert found.tied == (("coulomb_friction",),) and found.falls[-1].added == "coulomb_friction"
     assert any("cogging joined too" in note for note in found.notes)
     assert [effect.name for effect in found.model.effects] == ["coulomb_friction"]
 
 
+@pytest.mark.usefixtures("cogging_may_be_nought")
 def test_what_is_left_of_a_pair_is_judged_by_itself(
     prepared: Prepared, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a pair one may be nought at its end: then the other one must have lowered the error without it."""
-    only = effect_sources(only=["coulomb_friction", "cogging"])
-    monkeypatch.setattr(
-        "hannes_lab.diagnose._may_be_nought", lambda search, found, limits: found.names[-1] == "cogging"
-    )
     monkeypatch.setattr("hannes_lab.diagnose.EACH_TAKES", 0.9999)
-    found = diagnose(prepared, only)
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]))
     assert found.verdict == "unknown" and not found.effects and not found.tied
     assert any("coulomb_friction joined too" in n and "must fall by 100 %" in n for n in found.notes)
     assert len(found.falls) == 2 and not found.model.effects

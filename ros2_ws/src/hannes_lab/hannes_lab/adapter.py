@@ -339,11 +339,13 @@ def other_units(rig: Rig, model: Model, features: Features) -> list[str]:
     """
     out: dict[str, str] = {}
     travel = getattr(rig, "sizes", {}).get("rad")
-    moves = {
-        t.unit(ENCODER): float(np.ptp(t.signals[ENCODER][1])) for t in features.trials if ENCODER in t.signals
-    }
+    moves = [
+        (float(np.ptp(t.signals[ENCODER][1])), t.unit(ENCODER))
+        for t in features.trials
+        if ENCODER in t.signals
+    ]
     if travel and moves:
-        unit, most = max(moves.items(), key=lambda item: item[1])
+        most, unit = max(moves)
         if not 1.0 / OTHER_SIZE < most / travel < OTHER_SIZE:
             out["sizes"] = (
                 f"{ENCODER} goes over {most:.3g} {unit}, and the adapter's `sizes` say {travel:g}: is one of them in "

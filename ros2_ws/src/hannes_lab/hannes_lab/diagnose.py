@@ -34,7 +34,7 @@ from .diagnosis import Diagnosis, Fall, FoundEffect, ParameterEstimate
 from .errors import SignalError
 from .executor import Executor
 from .experiments import separating_experiments
-from .falls import WITHOUT_EFFECT, error_falls, relative_errors, worth_showing
+from .falls import WITHOUT_EFFECT, error_falls, left_out_errors, worth_showing
 from .features import data_used
 from .fit import Fit
 from .prepare import Prepared
@@ -229,10 +229,9 @@ def _behind_the_law(
     """
     bare = Choice(search, null, limits, is_adequate(search, null, limits), ())
     singles = [c for key, c in search.found.items() if len(key) == 1 and law not in key]
-    gains = [
+    if not any(
         null.penalised + PENALTY - c.penalised >= needed_gain(bare, null, c, first=True) for c in singles
-    ]
-    if not any(gains):
+    ):
         return None
     other = choose(search, null, limits, max_effects, (law,))
     return other if other.adequate and other.best.names else None
@@ -378,10 +377,8 @@ def _foretells(falls: Sequence[Fall]) -> bool:
     On either: what a condition has of its own, like an object, cannot be foretold from the others.  The nominal model
     as it was given is one of those before: its fit weighs what a model of its form may be off, and may raise the error.
     """
-    measures = ([f.held_out for f in falls], [f.held_out_conditions for f in falls])
+    measures = (left_out_errors(falls), [f.held_out_conditions for f in falls])
     known = [errors for errors in measures if np.isfinite(errors[1:]).all()]
-    if not known:
-        known = [errors for errors in [relative_errors(falls)] if np.isfinite(errors[1:]).all()]
     return not known or any(e[-1] ** 2 <= (1.0 - FORETOLD) * np.nanmin(e[:-1]) ** 2 for e in known)
 
 

@@ -105,13 +105,8 @@ def _problem_builder(search: Search, rig: Rig, values: Mapping[str, float]) -> A
 def worth_showing(
     search: Search, best: Candidate, falls: tuple[Fall, ...]
 ) -> tuple[Candidate, tuple[Fall, ...]]:
-    """The effects up to that with which the error on held-out closures is least: what follows only fits better.
-
-    The error on held-out conditions where no closure was repeated.
-    """
-    errors = [fall.held_out for fall in falls[1:]]
-    if not np.isfinite(errors).any():
-        errors = relative_errors(falls)[1:]
+    """The effects up to that with which what was left out is foretold best: what follows only fits better."""
+    errors = left_out_errors(falls)[1:]
     if not np.isfinite(errors).any():
         return best, falls
     keep = 1 + int(np.nanargmin(errors))
@@ -119,6 +114,12 @@ def worth_showing(
     if len(names) == len(best.names):
         return best, falls
     return search.fit_of(names), falls[: keep + 1]
+
+
+def left_out_errors(falls: Sequence[Fall]) -> list[float]:
+    """Error on held-out closures of each step; where none was repeated, on held-out conditions (relative_errors)."""
+    errors = [fall.held_out for fall in falls]
+    return errors if np.isfinite(errors[1:]).any() else relative_errors(falls)
 
 
 def relative_errors(falls: Sequence[Fall]) -> list[float]:

@@ -193,9 +193,7 @@ MODEL_OF = {"reduced": "nominal", "mujoco": "nominal_mujoco"}
 
 def other_plant(trials: Sequence[Trial], model: Model) -> list[str]:
     """A sentence where this project's other plant made the recordings: its parameters are not felt alike."""
-    made = {
-        str(trial.options["plant"]) for trial in trials if is_described(trial) and "plant" in trial.options
-    }
+    made = {str(trial.options["plant"]) for trial in trials if is_described(trial)}
     return [
         f"the recordings say that plant '{plant}' made them, and model '{model.name}' has '{model.plant}': the two are "
         "not of one form (the full hand's spring is felt softer at the pulley than the reduced hand's), so they are "

@@ -48,8 +48,8 @@ def phase_of(
     # A reference that stands all through is at rest where the others are lowest too; one that never moves is held.
     whole = float(np.ptp(trial.reference))
     if high - low <= STANDS * whole:
-        low = float(trial.reference.min()) - (0.0 if whole > 0.0 else span)
-    away = reference - low > 0.02 * span
+        low = float(trial.reference.min())
+    away = (reference - low > 0.02 * span) | (whole == 0.0)
     moving = np.abs(slope) > 0.02 * steepest
     out[away & ~moving] = PHASES.index("hold")
     out[moving & (slope > 0)] = PHASES.index("void")

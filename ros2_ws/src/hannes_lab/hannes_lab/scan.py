@@ -137,11 +137,16 @@ class Scan:
         if all(c.prior for c in base.coordinates):
             return start
         kept = {**start, **base.point}
-        problem, costs = seen_from(self.problem, base), []
-        for one in (start, kept):
-            r = problem.residual(model, {c.name: c.value(one.get(c.name, 0.0)) for c in coordinates})
-            costs.append(float(r @ r) + sum(one.get(c.name, 0.0) ** 2 for c in coordinates if c.prior))
-        return start if costs[0] <= costs[1] else kept
+        problem = seen_from(self.problem, base)
+        return min((start, kept), key=lambda one: _cost(problem, model, coordinates, one))
+
+
+def _cost(
+    problem: Problem, model: Model, coordinates: Sequence[Coordinate], start: Mapping[str, float]
+) -> float:
+    """Cost of a point (z by name, 0 where it names none) in closed loop: its misfit and what the priors charge."""
+    r = problem.residual(model, {c.name: c.value(start.get(c.name, 0.0)) for c in coordinates})
+    return float(r @ r) + sum(start.get(c.name, 0.0) ** 2 for c in coordinates if c.prior)
 
 
 class _Place:
@@ -233,9 +238,7 @@ class _Place:
             if size == 0.0 or apart > SAME * size:
                 continue
             start = {**self.here, **shape, c.name: 0.0, name: own.z(own.value(0.0) + more)}
-            residual = self.at(start)
-            charged = sum(start[other.name] ** 2 for other in place.coordinates if other.prior)
-            out.append((float(residual @ residual) + charged, start))
+            out.append((_cost(self.problem, self.model, self.coordinates, start), start))
         return out
 
     def followed(self, derivative: Array) -> tuple[float, float]:

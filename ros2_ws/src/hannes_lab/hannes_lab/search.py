@@ -606,12 +606,12 @@ class Search:
         items.sort(key=lambda item: item[3][0].cost)
         if not self.slow:
             # What leaves a base that is far off for a machine within its tolerances is dearer until it has arrived.
-            back = [item for item in items[REFIT:] if item[0].far_off and farthest(item[3][0]) <= FAR][:BACK]
-            chosen_ones = [*items[:REFIT], *back]
+            back = [k for k, item in enumerate(items) if item[0].far_off and farthest(item[3][0]) <= FAR]
+            carried = {*range(len(items[:REFIT])), *[k for k in back if k >= REFIT][:BACK]}
             done = self.each(
-                Search._settled, [(*item, worth, short) for item in chosen_ones], f"{text}: refit"
+                Search._settled, [(*items[k], worth, short) for k in sorted(carried)], f"{text}: refit"
             )
-            rest = [item for item in items[REFIT:] if not any(item is one for one in back)]
+            rest = [item for k, item in enumerate(items) if k not in carried]
             ended = [_candidate((*b.names, n), replace(fits[0], complete=False)) for b, n, _, fits in rest]
             return [], [*done, *ended]
         # A further effect that gains nothing where its fit ends is near to where it would settle.

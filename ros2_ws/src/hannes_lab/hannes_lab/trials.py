@@ -275,10 +275,10 @@ def reference_on_grid(
     later = np.append(np.diff(time) > 0.0, True)
     time, values = time[later], values[later]
     grid = np.arange(max(2, math.floor(duration / period + 1e-6) + 1)) * period
-    step = float(np.median(np.diff(time))) if time.size > 1 else period
+    steps = np.diff(time) if time.size > 1 else np.array([period])
+    step = float(np.median(steps))
     # Stamps in whole milliseconds: at 60 Hz the median step is 17 ms.
-    steps = np.diff(time)
-    rate = 1.0 / float(steps[steps < 1.5 * step].mean()) if time.size > 1 else 1.0 / period
+    rate = 1.0 / float(steps[steps < 1.5 * step].mean())
     said = f"the reference is logged at {rate:.0f} Hz; "
     if time.size < 4 or 1.0 / step >= hold_rate:
         index = np.clip(np.searchsorted(time, grid + 1e-7, side="right") - 1, 0, time.size - 1)

@@ -13,7 +13,7 @@ from .choose import Choice, can_be_held_out, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
-from .falls import WITHOUT_EFFECT, fall_sentence, relative_errors
+from .falls import WITHOUT_EFFECT, fall_sentence, left_out_errors
 from .fit import Fit, fit
 from .problem import Coordinate, Problem, nuisance_coordinate
 from .report_text import EITHER
@@ -143,13 +143,12 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
 
 def worse_fitted(falls: Sequence[Fall]) -> tuple[str, ...]:
     """A sentence where the fit of the nominal model has a larger error than the nominal model itself."""
-    given, fitted = falls[0].held_out, falls[1].held_out
-    said = f"{fitted:.2f}) than as given ({given:.2f} times the repeatability"
-    if not np.isfinite([given, fitted]).any():
-        given, fitted = relative_errors(falls)[:WITHOUT_EFFECT]
-        said = f"on conditions that were left out) than as given ({given:.2f} of the error"
+    given, fitted = left_out_errors(falls)[:WITHOUT_EFFECT]
     if not fitted > given:
         return ()
+    said = f"{fitted:.2f}) than as given ({given:.2f} times the repeatability"
+    if not np.isfinite(falls[1].held_out):
+        said = f"on conditions that were left out) than as given ({given:.2f} of the error"
     return (
         f"the nominal model is further off as fitted ({said}): a fit weighs each sample by how well it is known and "
         "how far a model of this form may be off, and pays for tolerances; these errors do not",

@@ -60,11 +60,14 @@ from .ports import (
     V,
 )  # fmt: skip
 
+_compiled = njit(cache=True, error_model="numpy")
+"""Divisions without Python's check for 0, which takes time: what is not finite is seen in the reading."""
+
 FASTEST = 1e4
 """rad/s or m/s; a machine that is faster has diverged, whatever its effects give."""
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
 def evaluate_effects(handle):  # type: ignore[no-untyped-def]
     """Sum the contributions of all active effects into the outputs; the inputs must be filled before."""
     x, y = handle[H_INPUTS], handle[H_OUTPUTS]
@@ -76,7 +79,7 @@ def evaluate_effects(handle):  # type: ignore[no-untyped-def]
         call_effect(table[1 + 3 * k], x, table[2 + 3 * k], table[3 + 3 * k], y)
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
 def watch_outputs(handle, place, speed):  # type: ignore[no-untyped-def]
     """Keep in mind that what the effects gave last is not finite, though the machine was: a limiter may hide it.
 
@@ -91,7 +94,7 @@ def watch_outputs(handle, place, speed):  # type: ignore[no-untyped-def]
         pointer_f8(handle[H_STATE])[S_UNDEFINED] = 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
 def begin_step(handle, voltage, q, v):  # type: ignore[no-untyped-def]
     """Time, delayed and limited command, and motor position into the inputs; returns nothing.
 
@@ -123,7 +126,7 @@ def begin_step(handle, voltage, q, v):  # type: ignore[no-untyped-def]
     x[SUPPLY] = limit
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
 def motor_torque(handle):  # type: ignore[no-untyped-def]
     """Torque at the pulley [N.m] of the brushed motor after this step.
 
@@ -163,7 +166,7 @@ def motor_torque(handle):  # type: ignore[no-untyped-def]
     return p[P_EFFICIENCY] * kt * p[P_RATIO] * mean
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
 def sense(handle, q, steps):  # type: ignore[no-untyped-def]
     """Fill time, encoder, current and effort of the reading after `steps` steps."""
     p, s = pointer_f8(handle[H_PARAMETERS]), pointer_f8(handle[H_STATE])
@@ -180,7 +183,7 @@ def sense(handle, q, steps):  # type: ignore[no-untyped-def]
     s[S_POSITION_READ] = position
 
 
-@njit(cache=True, error_model="numpy")
+@_compiled
 def dry_friction(momentum, impulse, mobility):  # type: ignore[no-untyped-def]
     """Velocity after an implicit dry-friction impulse: sticks exactly, never reverses the motion.
 
