@@ -345,6 +345,21 @@ def test_a_profile_of_its_own_waits_for_the_hand(peer):
         assert np.searchsorted(profile[:100_000], given[-1]) < len(given) + missed
 
 
+def test_a_profile_of_its_own_waits_for_those_who_shall_hear_all_of_it(peer):
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    sensors = Sensors(peer, reference=None)
+    own = {"reference": "half_sine", "reference_period": 400.0, "reference_subscribers": 1}
+    with processes(NodeProcess(NAME, **own, **Sensors.patient)):
+        sensors.until(
+            lambda s: s["message"] == "waiting for 1 subscriber(s) of reference_position", "what it waits for"
+        )
+        peer.hear("reference_position")
+        sensors.until(drives, "a driven motor")
+        first = convert.float64_value(peer.heard["reference_position"][0])
+    assert first == half_sine(period=400.0)[0]
+
+
 def test_the_motor_is_driven_only_while_active_and_activation_clears_the_integrator(peer):
     peer.hear("motor_voltage")
     with processes(NodeProcess(NAME, clock="lockstep", autostart=False)):

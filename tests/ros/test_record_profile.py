@@ -15,7 +15,7 @@ import pytest
 from graph import NodeProcess, Peer, processes
 from hannes_bags.reading import read_bag
 from hannes_bringup import graph_watch
-from hannes_bringup.graph_watch import follow_profile, require_free_hand
+from hannes_bringup.graph_watch import follow_profile, followers_of_the_reference, require_free_hand
 from hannes_control.reference import make_profile
 from hannes_description.errors import HannesError
 from hannes_ros import convert
@@ -68,6 +68,13 @@ def test_a_profile_is_recorded_to_its_end(
     played = make_profile("half_sine", closures=1, period=2.0)
     assert reference.values[0] < 0.5 and reference.values.max() > 14.0 and reference.values[-1] == 0.0
     assert np.isin(reference.values, played).all() and reference.time[-1] - reference.time[0] > 2.0
+
+
+def test_who_hears_the_reference_of_a_profile() -> None:
+    assert followers_of_the_reference(None) == 2
+    assert followers_of_the_reference(["motor/state", "reference_position"]) == 2
+    assert followers_of_the_reference([graph_watch.REFERENCE]) == 2
+    assert followers_of_the_reference(["motor/state"]) == 1
 
 
 def test_a_profile_is_refused_where_it_would_mix_with_another_reference(peer: Peer) -> None:

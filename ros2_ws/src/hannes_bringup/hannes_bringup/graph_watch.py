@@ -124,6 +124,13 @@ def wait_for_recorder(running: Callable[[], bool]) -> None:
             _spin(executor, 0.05)
 
 
+def followers_of_the_reference(recorded: list[str] | None) -> int:
+    """How many hear the reference of a profile from its begin on: `follow_profile`, and the recorder if the reference
+    is among the topics that it records; None: all of the hand's."""
+    names = [REFERENCE] if recorded is None else recorded
+    return 1 + any(name in (REFERENCE, REFERENCE.removeprefix(f"/{DEFAULT_NAMESPACE}/")) for name in names)
+
+
 def follow_profile(seconds: float, running: Callable[[], bool]) -> None:
     """Return when the controller has played its profile of so many seconds and the hand has come to rest, or when
     `running` is no longer true.

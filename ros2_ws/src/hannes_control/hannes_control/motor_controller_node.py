@@ -58,6 +58,9 @@ class MotorControllerParameters:
     reference_period: float = parameter(
         0.0, "period of the profile, 0 for its own", lower=0.0, upper=1e3, unit="s"
     )
+    reference_subscribers: int = parameter(
+        0, "subscribers that the reference must have before a profile of its own begins", lower=0, upper=100
+    )
     subscribers: int = parameter(
         1, "subscribers that motor/voltage must have before the first answer in lockstep", lower=1, upper=100
     )
@@ -158,12 +161,16 @@ class MotorController(HannesNode, LifecycleNode):
         topics.subscription(
             self, "encoder_position", self._on_tick_state if self._lockstep else self._on_state, heard
         )
+        hearers = [("motor_voltage", self._voltage, p.subscribers)] if self._lockstep else []
+        if self._own_reference is not None:
+            hearers.append(("reference_position", self._own_reference, p.reference_subscribers))
         self._peers = Peers(
             {
-                f"{p.subscribers} subscriber(s) of motor/voltage": (
-                    self._voltage.get_subscription_count,
-                    p.subscribers,
+                f"{least} subscriber(s) of {topics.signal(name).topic}": (
+                    output.get_subscription_count,
+                    least,
                 )
+                for name, output, least in hearers
             }
         )
         self._diagnostics = Diagnostics(self, self._health, self._status)
@@ -349,7 +356,7 @@ class MotorController(HannesNode, LifecycleNode):
         if elapsed * self._p.period * 1e3 > self._p.pause_limit_ms:
             self._tripped = True
             return
-        if self._state is None or self._current is None:
+        if self._state is None or self._current is None or self._peers.missing():
             self._missed -= elapsed - 1  # nothing was to be done in them
             return
         if now - min(self._state_at, self._current_at) > self._p.state_timeout_ms / 1e3:
@@ -516,7 +523,7 @@ class MotorController(HannesNode, LifecycleNode):
                 strict=True,
             )
             if value is None and name not in self._health.faults
-        ]
+        ] + self._peers.missing()
         if absent:
             waiting, now = f"waiting for {', '.join(absent)}", monotonic()
             self._waits_since = self._waits_since or now

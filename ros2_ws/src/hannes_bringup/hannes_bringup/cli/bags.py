@@ -105,8 +105,15 @@ def _record_profile(
     controller |= {f"reference_{name}": value for name, value in given.items()}
     require_ros()
     apply_ros_environment()
-    from hannes_bringup.graph_watch import follow_profile, require_free_hand, wait_for_recorder
+    from hannes_bringup.graph_watch import (
+        follow_profile,
+        followers_of_the_reference,
+        require_free_hand,
+        wait_for_recorder,
+    )
 
+    told = any(word.startswith("topics:=") for word in more)
+    controller["reference_subscribers"] = followers_of_the_reference([] if told else recorder.get("topics"))
     require_free_hand(SEEK)
     environment = ros_environment()
     raise_on_signals()
