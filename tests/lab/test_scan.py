@@ -1,5 +1,6 @@
 """What a scan of the strengths and shapes of an effect hands to the fits, and which of these are carried on."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -63,3 +64,28 @@ def test_what_a_parameter_took_over_is_tried_in_its_effects_place() -> None:
     found = search.extend([null], list(sources), "one")
     assert found[0].names == ("joint_friction",) and not found[0].far_off
     assert found[0].fit.values["joint_friction.level"] == pytest.approx(0.006, rel=0.3)
+
+
+def test_a_parameter_that_went_to_nought_is_stepped_where_numbers_are() -> None:
+    """Less viscous friction than none has no logarithm; the effect in its place may be negative."""
+    made, _ = make_set(Model.load(), [], seed=32, closures=5, conditions=("fast",))
+    prepared = prepare([make_trial(one) for one in made], Model.load())
+    name = "direction_dependent_friction"
+    search = Search(
+        prepared.problem,
+        prepared.model,
+        prepared.nuisances,
+        effect_sources(only=[name], model=prepared.model),
+    )
+    found = search.null().fit
+    at = [c.name for c in found.coordinates].index("friction.viscous")
+    wide = replace(found.coordinates[at], log=True, scale=0.5, lower=0.0)
+    z = found.z.copy()
+    z[at] = wide.z(1e-5 * wide.offset)
+    places = tuple(wide if k == at else c for k, c in enumerate(found.coordinates))
+    found = replace(found, coordinates=places, z=z)
+    kind, (model, coordinates) = search.effect(name), search.with_effects((name,))
+    coordinates = tuple(wide if c.name == wide.name else c for c in coordinates)
+    place = _Place(search.scan, kind, found, model, coordinates)
+    with np.errstate(all="raise"):
+        place.swapped({}, f"{name}.viscous")

@@ -231,9 +231,11 @@ class _Place:
             more = c.value(float(z)) - c.value(0.0)
             if not (c.nuisance and c.unit == own.unit and abs(z) > NEAR and own.lower <= more <= own.upper):
                 continue
-            little = c.value(float(z)) + SMALL * more
-            theirs = self.at({**shape, c.name: c.z(little)}) - place.residual
-            ours = self.at({**shape, name: own.z(own.value(0.0) + SMALL * more)}) - place.residual
+            here, step = c.value(float(z)), SMALL * more
+            if here + step <= max(c.lower, 0.0 if c.log else -math.inf):
+                step = -step
+            theirs = self.at({**shape, c.name: c.z(here + step)}) - place.residual
+            ours = self.at({**shape, name: own.z(own.value(0.0) + step)}) - place.residual
             apart, size = float(np.linalg.norm(ours - theirs)), float(np.linalg.norm(theirs))
             if size == 0.0 or apart > SAME * size:
                 continue
