@@ -182,4 +182,5 @@ def test_effects_that_only_replace_what_the_model_had_are_no_answer(
     given.setattr(module, "led_off", lambda base, c: why if reason == "led_off" else "")
     choice = choose_greedily(search_of(NULL, best), NULL, LIMITS, 3)
     assert choice.enough == choice.adequate == (not why)
-    assert (why in choice.left and "to 1.1 times" in choice.left) == bool(why)
+    assert (why in choice.left and "no more than the machine repeats" in choice.left) == bool(why)
+    assert choice.other_model == bool(why)

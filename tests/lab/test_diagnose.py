@@ -22,6 +22,7 @@ from hannes_lab.errors import SignalError
 from hannes_lab.falls import fall_sentence, relative_errors, worth_showing
 from hannes_lab.fit import Fit, fit
 from hannes_lab.hide import DEFAULT_CONDITIONS, Truth, make_set
+from hannes_lab.intervals import intervals_of
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.search import Candidate, Search
 from hannes_lab.trials import make_trial
@@ -527,7 +528,9 @@ def test_an_interval_that_the_end_of_the_range_cuts_is_said(gloved: Search) -> N
     best = gloved.fitted(("glove_stiffness",))
     limits = chance(gloved.problem, best.fit, gloved.signatures(best))
     missed = SignalError("slow", "motor_current", "A", 0.1, 0.05, 2.0)
-    (effect,) = found_effects(gloved, best, limits, (Fall("", 1.0, 1.0, {}, (missed,)),) * 2)
+    (effect,) = found_effects(
+        gloved, best, intervals_of(best.fit, limits), (Fall("", 1.0, 1.0, {}, (missed,)),) * 2
+    )
     main = next(iter(effect.parameters))
     whole = next(c for c in best.fit.coordinates if c.name == f"glove_stiffness.{main}")
     p = replace(effect.parameters[main], high=whole.upper, identified=True)
@@ -557,6 +560,11 @@ def test_an_error_that_rises_is_said_to_rise() -> None:
     given = fall("nominal, as given", 3.0, {"slow": 2.0, "fast": 4.0})
     assert "falls from 3.00 (nominal, as given) to 2.00" in fall_sentence([given, steps[1], better])
     assert fall_sentence(steps) == "The error on held-out closures is 4.00 times the repeatability."
+    said = fall_sentence([*steps, better], by_conditions=True)
+    assert said.startswith(
+        "The error on conditions that were left out of the fit falls from 4.00 (nominal, fitted) to"
+    )
+    assert said.endswith("(on held-out closures from 4.00 to 2.00).")
     said = fall_sentence([*steps, worse])
     assert "rises from 4.00 (nominal, fitted) to 4.50 times" in said
     assert "'slow' from 3.00 to 1.00, 'fast' from 5.00 to 6.00" in said

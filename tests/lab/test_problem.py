@@ -107,3 +107,15 @@ def test_a_tolerance_may_be_wider_downwards() -> None:
     assert [c.value(z) for z in (-2.0, -1.0, 0.0, 1.0)] == pytest.approx([0.8, 1.4, 2.0, 2.2])
     assert all(c.z(c.value(z)) == pytest.approx(z) for z in (-3.0, -0.1, 0.0, 0.1, 3.0))
     assert c.bounds == (pytest.approx(-3.3), np.inf)
+
+
+def test_a_wide_tolerance_takes_a_friction_to_nought_but_not_below() -> None:
+    """sd 0.5: nothing at all is two tolerances off, four times as much 2.8."""
+    c = nuisance_coordinate(Nuisance("friction", 2.0, 0.5, True, unit="N.m", lower=0.02, below=0.5))
+    assert c.value(-1.0) == pytest.approx(1.0) and c.value(-5.0) == 0.02
+    assert c.value(np.log(4.0) / 0.5) == pytest.approx(8.0)
+    assert c.bounds[0] == pytest.approx(-1.98) and c.bounds[1] == np.inf
+    for z in (-1.5, -1e-9, 0.0, 1e-9, 2.0):
+        assert c.z(c.value(z)) == pytest.approx(z, abs=1e-12)
+    slopes = [(c.value(h) - c.value(0.0)) / h for h in (-1e-6, 1e-6)]
+    assert slopes == pytest.approx([1.0, 1.0], rel=1e-5), "no kink at the nominal value"

@@ -256,7 +256,7 @@ def test_little_explained_is_unknown(prepared: Prepared) -> None:
     found = diagnose(prepared, effect_sources(only=["cogging", "command_delay"]), greedy=True)
     assert found.verdict == "unknown"
     assert "not one of those that were looked for (cogging, command_delay)" in found.summary
-    assert any("less than half would be an answer" in note for note in found.notes)
+    assert "more than half is left" in found.summary
 
 
 def test_unknown_without_greedy_says_what_else_can_be_done(prepared: Prepared) -> None:
@@ -347,7 +347,7 @@ def test_an_error_as_small_as_the_machine_repeats_leaves_nothing_to_look_for(
         monkeypatch.setattr(f"hannes_lab.{module}.AS_IT_REPEATS", 1e6)
     found = diagnose(prepared, sources)
     assert found.verdict == "nothing" and not found.effects, "though the effect would lower it"
-    assert "error on conditions that were left out is" in found.summary and "chance" not in found.summary
+    assert "as close to the recordings as they repeat" in found.summary and "chance" not in found.summary
     assert any("leaves nothing to look for" in note for note in found.notes)
 
 

@@ -12,7 +12,7 @@ from hannes_sim.effect import load_effect
 from hannes_sim.plant import PlantDiverged
 
 from .chance import chance
-from .diagnose import fitted_model, found_effects
+from .diagnose import fitted_model, found_effects, spans_of
 from .diagnosis import Fall, FoundEffect, both_models
 from .executor import Executor
 from .falls import error_falls, fall_sentence
@@ -26,6 +26,7 @@ class Addition:
     """The model with the effects, and what they are worth on data that took no part in their fit.
 
     given   the model to which they were added
+    nominal  its values, fitted without them
     """
 
     given: Model
@@ -35,6 +36,7 @@ class Addition:
     data: tuple[Mapping[str, Any], ...]
     notes: tuple[str, ...]
     values: Mapping[str, float]
+    nominal: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -81,7 +83,7 @@ def add_effects(
         executor=executor or Executor(),
         progress=progress,
     )
-    best = search.null()
+    best = null = search.null()
     for k, name in enumerate(sources):
         progress(k, len(sources), f"fit with {name}")
         best = search.polish(search.add(best, name))
@@ -90,14 +92,16 @@ def add_effects(
     best = search.with_spread(best)
     limits = chance(search.problem, best.fit, search.signatures(best))
     falls = error_falls(replace(prepared, problem=search.problem), search, best, first=first)
+    intervals = spans_of(search, best, limits, falls)
     return Addition(
         prepared.model,
-        with_provenance(fitted_model(prepared.model, search, best, limits), prepared, falls),
-        found_effects(search, best, limits, falls),
+        with_provenance(fitted_model(prepared.model, best, search, intervals), prepared, falls),
+        found_effects(search, best, intervals, falls),
         falls,
         data_used(prepared.features),
         prepared.notes,
         best.fit.values,
+        null.fit.values,
     )
 
 

@@ -12,7 +12,7 @@ from .adequacy import disbelieved, distorted, is_adequate, leads_back, led_off, 
 from .chance import Chance, chance
 from .diagnosis import Rank
 from .features import Features
-from .greedy import AS_IT_REPEATS, JUDGED, grow, held_out_error
+from .greedy import AS_IT_REPEATS, JUDGED, grow, held_out_error, largest_error
 from .search import HOPELESS, PENALTY, Candidate, Search, key_of
 
 WORTHWHILE = 0.05
@@ -79,6 +79,7 @@ class Choice:
     idle     where no effect is named: a sentence on those that fit better, but foretell no better what took no part in
              the fit
     left     a sentence on what a greedy choice leaves, where something is
+    other_model  that is no more than the machine repeats, but with a model that is not believed
     excluded effects that are not looked for
     """
 
@@ -92,6 +93,7 @@ class Choice:
     enough: bool = False
     idle: str = ""
     left: str = ""
+    other_model: bool = False
     excluded: tuple[str, ...] = ()
 
     @property
@@ -204,16 +206,15 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
 
     first, last  error on held-out conditions of the fitted nominal model, and of the chosen one
     """
-    search, best, left = choice.search, choice.best, ""
-    adequate, repeats = is_adequate(search, best, choice.limits), last <= AS_IT_REPEATS
+    search, best, left, other_model = choice.search, choice.best, "", False
+    adequate = is_adequate(search, best, choice.limits)
+    repeats = last <= AS_IT_REPEATS or (not best.names and largest_error(search, best) <= AS_IT_REPEATS)
     enough = repeats or (bool(best.names) and halved(first, last))
     instead = (disbelieved(search, best) or led_off(null, best)) if best.names else ""
     if enough and instead:
         adequate = enough = False
-        left = (
-            f"what was added lowers the error on held-out conditions to {last:.3g} times the repeatability, but "
-            f"{instead}"
-        )
+        other_model = repeats
+        left = f"what was added leaves {'no more than the machine repeats' if repeats else 'little'}, but {instead}"
     elif enough and not adequate and not repeats:
         left = (
             f"the {shortfall(search, best, choice.limits)}: something smaller is left that the "
@@ -221,10 +222,10 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
         )
     elif best.names and not (adequate or enough):
         left = (
-            f"what was added lowers the error on held-out conditions from {first:.3g} to {last:.3g} times the "
-            "repeatability; less than half would be an answer"
+            "of the error on conditions that were left out, as far as it is above the repeatability, more than half is "
+            "left"
         )
-    return replace(choice, adequate=adequate, enough=enough, left=left)
+    return replace(choice, adequate=adequate, enough=enough, left=left, other_model=other_model)
 
 
 def halved(first: float, last: float) -> bool:

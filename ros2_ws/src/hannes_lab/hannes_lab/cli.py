@@ -46,6 +46,7 @@ from .hand import HandRig
 from .own_effect import along_reference, check_own_effects, first_closure
 from .own_law import check_own_code
 from .prepare import Prepared, load_trials, prepare, read_trials
+from .report_text import NO_FINDING
 from .rig import load_rig
 from .trials import SIGNALS as COMPARED
 from .trials import UNITS, stem_of
@@ -396,7 +397,17 @@ def diagnose(
             with_provenance(named, prepared, found.falls, _command()).save(out)
         if report:
             _report_of(report, prepared, found)
+    if add and found.verdict == "unknown" and found.effects and not json:
+        typer.echo("The model file holds the nearest effects, which are no finding.")
     _say_files(json, report, out if add else None)
+
+
+def _before(prepared: Prepared, found: Diagnosis | Addition) -> Comparison:
+    """The given model beside the recordings: fitted, where something was added to it, so that this is all they differ
+    in."""
+    return compare_model(
+        prepared, values=found.nominal if found.effects else None, fitted=bool(found.effects)
+    )
 
 
 def _after(prepared: Prepared, found: Diagnosis | Addition) -> Comparison:
@@ -405,12 +416,14 @@ def _after(prepared: Prepared, found: Diagnosis | Addition) -> Comparison:
 
 def _report_of(path: Path, prepared: Prepared, found: Diagnosis | Addition) -> None:
     """The report of a model before and after what was found."""
-    _write_report(path, comparison=compare_model(prepared), after=_after(prepared, found), diagnosis=found)
+    _write_report(path, comparison=_before(prepared, found), after=_after(prepared, found), diagnosis=found)
 
 
 def _show_diagnosis(found: Diagnosis, machine: str) -> None:
     console = text_console()
     console.print(f"[bold]{found.verdict.upper()}[/bold]  {found.summary}")
+    if found.verdict == "unknown" and found.effects:
+        console.print(f"\n{NO_FINDING}")
     for effect in found.effects:
         console.print(f"\n[bold]{effect.title}[/bold] ({effect.name})")
         for name, p in effect.parameters.items():

@@ -37,11 +37,14 @@ from .experiments import separating_experiments
 from .falls import WITHOUT_EFFECT, error_falls, left_out_errors, worth_showing
 from .features import data_used
 from .fit import Fit
+from .intervals import intervals_of, strain
 from .prepare import Prepared
 from .screen import usable_effects
 from .search import FAR, PENALTY, Candidate, Progress, Search, silent
+from .twins import twins
 from .wording import (
     bent_sentence,
+    far_off,
     idle_sentence,
     law_sentence,
     led_back_sentence,
@@ -133,15 +136,29 @@ def diagnose(
     verdict = "unknown" if not answer.holds else "effects" if best.names else "nothing"
     tied = tied_sets(choice) if verdict == "effects" else ()
     best = search.with_spread(best)
-    effects = found_effects(search, best, limits, falls)
+    intervals = spans_of(search, best, limits, falls)
+    effects = found_effects(search, best, intervals, falls)
     clock = other_clock(search.problem, best.fit) if greedy or verdict == "unknown" else None
+    same = twins(search, best, far_off(best))
     experiments = (
         separating_experiments(prepared, search, [search.fit_of(n) for n in tied]) if len(tied) > 1 else ()
     )
     return Diagnosis(
         verdict=verdict,
         summary=summary(
-            search, verdict, effects, tied, falls, limits, choice, best, answer.bent, only, clock
+            search,
+            verdict,
+            effects,
+            tied,
+            falls,
+            limits,
+            choice,
+            best,
+            answer.bent,
+            only,
+            clock,
+            greedy,
+            same,
         ),
         effects=effects,
         tied=tied,
@@ -155,19 +172,21 @@ def diagnose(
         ),
         chance=limits,
         costs={"nominal_fitted": answer.null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
-        nuisances=_nuisance_table(best.fit, limits),
+        nuisances=_nuisance_table(best.fit, intervals),
         notes=(
             *prepared.notes,
             *choice.notes,
-            *((choice.left,) if choice.left else ()),
+            *((choice.left,) if choice.left and verdict != "unknown" else ()),
             *notes(search, best, verdict, effects, experiments, greedy, clock),
             *worse_fitted(falls),
         ),
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
         given=prepared.model,
-        model=fitted_model(prepared.model, search, best, limits),
+        model=fitted_model(prepared.model, best, search, intervals),
         values=best.fit.values,
+        nominal=answer.null.fit.values,
+        greedy=greedy,
     )
 
 
@@ -382,12 +401,23 @@ def _foretells(falls: Sequence[Fall]) -> bool:
     return not known or any(e[-1] ** 2 <= (1.0 - FORETOLD) * np.nanmin(e[:-1]) ** 2 for e in known)
 
 
-def fitted_model(model: Model, search: Search, best: Candidate, limits: Chance) -> Model:
+def spans_of(
+    search: Search, best: Candidate, limits: Chance, falls: Sequence[Fall]
+) -> dict[str, tuple[float, float]]:
+    """95 % intervals of a fitted set; on a machine of others by how far it moves without a condition, too."""
+    problem = search.problem
+    foreign = problem.rig.foreign or problem.discrepancy
+    wider = strain(problem.features, best.fit, limits, falls[-1].left_out) if foreign else {}
+    return intervals_of(best.fit, limits, wider)
+
+
+def fitted_model(
+    model: Model, best: Candidate, search: Search, intervals: Mapping[str, tuple[float, float]]
+) -> Model:
     """The model with fitted nuisance parameters and effects, as it goes into a file, and the effects' intervals."""
     values, names = best.fit.values, model.names
     known = {n: v for n, v in values.items() if "@" not in n and n in names}
     out = model.with_values(known, status="identified", source=FITTED)
-    intervals = intervals_of(best.fit, limits)
     for name in best.names:
         out = out.with_effect(_entry(search, name, values))
     spans = {
@@ -404,24 +434,10 @@ def _entry(search: Search, name: str, values: Mapping[str, float]) -> EffectEntr
     return kind.entry(own, source=source, status="identified", where=FITTED)
 
 
-def intervals_of(found: Fit, limits: Chance) -> dict[str, tuple[float, float]]:
-    """95 % intervals by name, from the curvature of the cost, inside the parameter's bounds.
-
-    Wider by as much as the misfit is larger than chance makes it.
-    """
-    inflate = max(1.0, found.cost / limits.median)
-    out = {}
-    for c, z, s in zip(found.coordinates, found.z, found.sd(inflate), strict=True):
-        ends = sorted((c.value(float(z - 1.96 * s)), c.value(float(z + 1.96 * s))))
-        out[c.name] = (ends[0], ends[1])
-    return out
-
-
 def found_effects(
-    search: Search, best: Candidate, limits: Chance, falls: Sequence[Fall]
+    search: Search, best: Candidate, intervals: Mapping[str, tuple[float, float]], falls: Sequence[Fall]
 ) -> tuple[FoundEffect, ...]:
     """The effects of a fitted set with parameters, intervals and the reason."""
-    intervals = intervals_of(best.fit, limits)
     at_end = {c.name for c in best.fit.at_end}
     return tuple(_found(search, best.fit, name, intervals, at_end, falls) for name in best.names)
 
@@ -471,8 +487,7 @@ def _missed(error: SignalError) -> str:
     return f"{error.rmse:.3g} {error.unit}{ratio}"
 
 
-def _nuisance_table(found: Fit, limits: Chance) -> dict[str, dict[str, Any]]:
-    intervals = intervals_of(found, limits)
+def _nuisance_table(found: Fit, intervals: Mapping[str, tuple[float, float]]) -> dict[str, dict[str, Any]]:
     return {
         c.name: {
             "value": c.value(float(z)),

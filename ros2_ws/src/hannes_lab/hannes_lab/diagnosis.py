@@ -62,6 +62,7 @@ class Fall:
     by_condition      error on each condition when it took no part in the fit
     held_out_conditions  one number for them all (errors.condition_error); with `--greedy` it decides
     held_out_signals  the same per signal, root mean square over the conditions in the signal's unit
+    left_out          condition -> where the fit without it ended, z by parameter
     """
 
     added: str
@@ -71,6 +72,7 @@ class Fall:
     signals: tuple[SignalError, ...]
     held_out_signals: Mapping[str, float] = field(default_factory=dict)
     held_out_conditions: float = math.nan
+    left_out: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -116,6 +118,8 @@ class Diagnosis:
 
     given   the model in which effects were looked for
     model   the same with what was found, fitted; `values` are those of all that was free
+    nominal  those of the given model, fitted without effects
+    greedy  the error on conditions that were left out decided
     """
 
     verdict: str
@@ -135,6 +139,8 @@ class Diagnosis:
     given: Model
     model: Model
     values: Mapping[str, float]
+    nominal: Mapping[str, float]
+    greedy: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         falls = self.falls
@@ -143,6 +149,7 @@ class Diagnosis:
             "summary": self.summary,
             "effects": [e.to_dict() for e in self.effects],
             "tied": [list(names) for names in self.tied],
+            "greedy": self.greedy,
             "experiments": [e.to_dict() for e in self.experiments],
             "error": {
                 "nominal": falls[0].held_out,

@@ -165,7 +165,19 @@ def held_out_condition_errors(
     start: Array,
     known: Mapping[str, Array] | None = None,
 ) -> dict[str, tuple[SignalError, ...]]:
-    """Errors on each condition when it took no part in the fit.
+    """Errors on each condition when it took no part in the fit; see held_out_conditions."""
+    found = held_out_conditions(problem, model, coordinates, start, known)
+    return {condition: errors for condition, (errors, _) in found.items()}
+
+
+def held_out_conditions(
+    problem: Problem,
+    model: Model,
+    coordinates: Sequence[Coordinate],
+    start: Array,
+    known: Mapping[str, Array] | None = None,
+) -> dict[str, tuple[tuple[SignalError, ...], dict[str, float]]]:
+    """Errors on each condition when it took no part in the fit, and where that fit ended (z by name).
 
     Parameters of a recording (its object, its own encoder zero: `name@recording`) cannot be known from the others:
     where no condition is left of it, they are fitted on the held-out one with everything else kept.
@@ -173,7 +185,7 @@ def held_out_condition_errors(
     known   derivatives (size,) by coordinate name that are taken as constant
     """
     features = problem.features
-    out: dict[str, tuple[SignalError, ...]] = {}
+    out: dict[str, tuple[tuple[SignalError, ...], dict[str, float]]] = {}
     if len(features.conditions) < 2:
         return out
     for condition in features.conditions:
@@ -189,5 +201,6 @@ def held_out_condition_errors(
             values = {**values, **fit(local, model, own, {}, rows=rows, evaluations=6).values}
         rig = anchored_at(problem.rig, model, values)
         errors = signal_errors(features, features.closures(rig, model, values))
-        out[condition] = tuple(e for e in errors if e.condition == condition)
+        told = {c.name: float(z) for c, z in zip(coordinates, found.z, strict=True) if c not in own}
+        out[condition] = tuple(e for e in errors if e.condition == condition), told
     return out

@@ -11,7 +11,7 @@ from .diagnosis import Fall
 from .errors import (
     condition_error,
     held_out_closures,
-    held_out_condition_errors,
+    held_out_conditions,
     overall,
     per_signal,
     signal_errors,
@@ -84,11 +84,14 @@ def _fall_in_worker(search: Search, candidate: Candidate, values: Mapping[str, f
     problem = search.problem.with_rig(slopes_at(search.problem.rig, f))
     build = _problem_builder(search, problem.rig, values)
     train, test = held_out_closures(build, features, f.model, f.coordinates, f.z)
-    held = held_out_condition_errors(problem, f.model, f.coordinates, f.z)
+    left_out = held_out_conditions(problem, f.model, f.coordinates, f.z)
+    held = {condition: errors for condition, (errors, _) in left_out.items()}
     by_condition = {condition: overall(own) for condition, own in held.items()}
     errors = signal_errors(features, features.closures(exact_rig(problem.rig), f.model, f.values))
     of_all = condition_error(features, held.values())
-    return train, test, by_condition, errors, per_signal(features, held.values()), of_all
+    signals = per_signal(features, held.values())
+    moved = {condition: z for condition, (_, z) in left_out.items()}
+    return train, test, by_condition, errors, signals, of_all, moved
 
 
 def _problem_builder(search: Search, rig: Rig, values: Mapping[str, float]) -> Any:
@@ -135,14 +138,16 @@ def relative_errors(falls: Sequence[Fall]) -> list[float]:
     return out
 
 
-def fall_sentence(falls: Sequence[Fall]) -> str:
+def fall_sentence(falls: Sequence[Fall], by_conditions: bool = False) -> str:
     """How the error on held-out closures falls, or that it does not; in the signals' units where nothing was repeated.
 
-    Where no effect was added, what it is.
+    Where no effect was added, what it is.  by_conditions: that on held-out conditions decided, and comes first.
 
     A fit weighs what is known of the model's own error; the error does not: it falls from that of the nominal model as
     it was given, where its fit made it larger.
     """
+    if by_conditions and np.isfinite([fall.held_out_conditions for fall in (*falls[:2], falls[-1])]).all():
+        return _by_conditions(falls)
     first, after = min(falls[:2], key=lambda fall: fall.held_out), falls[-1].held_out
     before = first.held_out
     if not np.isfinite([before, after]).all():
@@ -160,6 +165,25 @@ def fall_sentence(falls: Sequence[Fall]) -> str:
     old, new = first.by_condition, falls[-1].by_condition
     each = [f"'{name}' from {old[name]:.2f} to {error:.2f}" for name, error in new.items() if name in old]
     return f"{said} (conditions left out: {', '.join(each)})." if each else f"{said}."
+
+
+def _by_conditions(falls: Sequence[Fall]) -> str:
+    """The same of conditions that were left out of the fit as a whole, with what the closures say beside it."""
+    what = "The error on conditions that were left out of the fit"
+    first, last = min(falls[:2], key=lambda fall: fall.held_out_conditions), falls[-1]
+    before, after = first.held_out_conditions, last.held_out_conditions
+    if len(falls) == WITHOUT_EFFECT:
+        closures = f" ({last.held_out:.2f} on held-out closures)" if np.isfinite(last.held_out) else ""
+        return f"{what} is {after:.2f} times the repeatability{closures}."
+    closures = (
+        f" (on held-out closures from {first.held_out:.2f} to {last.held_out:.2f})"
+        if np.isfinite([first.held_out, last.held_out]).all()
+        else ""
+    )
+    verb = "falls" if after <= before else "rises"
+    return (
+        f"{what} {verb} from {before:.2f} ({first.added}) to {after:.2f} times the repeatability{closures}."
+    )
 
 
 def errors_in_units(falls: Sequence[Mapping[str, Any]]) -> tuple[bool, list[dict[str, float]]]:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from .adequacy import distorted
-from .errors import condition_error, held_out_condition_errors
+from .errors import condition_error, held_out_condition_errors, signal_errors
 from .search import Candidate, Search
 
 JUDGED = 3
@@ -63,6 +63,19 @@ def held_out_error(search: Search, candidate: Candidate, quickly: bool = False) 
     return condition_error(search.problem.features, errors.values())
 
 
+def largest_error(search: Search, candidate: Candidate) -> float:
+    """The largest error of a signal in a condition of the fit, in multiples of the repeatability; infinite if none is
+    known.
+
+    Up to AS_IT_REPEATS the recordings show nothing that the nominal model lacks.  Fitted on some of the conditions it
+    may still foretell another badly: then these do not tell its parameters apart.
+    """
+    problem, fit = search.problem, candidate.fit
+    features = problem.features
+    errors = signal_errors(features, features.closures(problem.rig, fit.model, fit.values))
+    return max((e.ratio for e in errors if math.isfinite(e.ratio)), default=math.inf)
+
+
 def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grown:
     """Add effects until the mean square of the held-out error falls by less than the part `gain`, or none is left.
 
@@ -81,16 +94,24 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
                 f"{AS_IT_REPEATS} it may be chance): the search stops here"
             )
             break
+        if not best.names and (largest := largest_error(search, best)) <= AS_IT_REPEATS:
+            notes.append(
+                f"in no signal of any condition is the error of the fit more than {largest:.2f} times the "
+                f"repeatability (up to {AS_IT_REPEATS} it may be chance): there is nothing to look for. That on "
+                f"conditions that were left out ({errors[-1]:.2f}) says how well the others tell the parameters"
+            )
+            break
         text = f"effect {len(best.names) + 1}"
         singles = search.extend([best], list(search.sources), text)
         if not singles:
             break
         first = first or tuple(singles)
-        found = _judge(search, singles, text, best, gain)
+        found = _judge(search, singles, text, best, gain, errors[-1])
         if not found.falls(errors[-1]) and len(best.names) + 2 <= max_effects:
             # Two effects may be worth it of which neither is alone.
             pairs = search.extend(singles[:JUDGED], list(search.sources), f"{text}, as a pair")
-            two = _judge(search, pairs, text, best, 1.0 - (1.0 - gain) ** 2) if pairs else found
+            asked = 1.0 - (1.0 - gain) ** 2
+            two = _judge(search, pairs, text, best, asked, errors[-1]) if pairs else found
             if two.falls(errors[-1]):
                 found = two
         if not found.falls(errors[-1]):
@@ -128,9 +149,11 @@ class _Judged:
 
 
 def _judge(
-    search: Search, candidates: Sequence[Candidate], text: str, base: Candidate, gain: float
+    search: Search, candidates: Sequence[Candidate], text: str, base: Candidate, gain: float, before: float
 ) -> _Judged:
     """The best of the best fits by held-out error; of those that are alike, the one with the fewest parameters.
+
+    One that would join too, and foretells as well, ties with it: also one of which the data leave something open.
 
     An effect that must be bent into another form is no candidate while there are others.
     Each error counts in multiples of what it may be at most (LEFT_OPEN, or 1 - gain, of the mean square without it).
@@ -148,7 +171,15 @@ def _judge(
     for candidate in judged:
         search.found[candidate.key] = candidate
     winner = min(alike, key=lambda k: (len(judged[k].fit.coordinates), scores[k]))
-    others = [k for k in alike if k != winner and most[k] == most[winner]]
+    joins = [error <= math.sqrt(part) * before for error, part in zip(held, most, strict=True)]
+    others = [
+        k
+        for k in range(len(judged))
+        if k != winner
+        and (
+            (k in alike and most[k] == most[winner]) or (joins[k] and held[k] <= (1.0 + ALIKE) * held[winner])
+        )
+    ]
     rivals = tuple(judged[k] for k in sorted(others, key=lambda k: held[k]))
     error = search.once(held_out_error, judged[winner], text=f"{text}: held-out conditions")
     return _Judged(judged[winner], error, rivals, most[winner], left_open[winner])

@@ -24,7 +24,7 @@ from hannes_description.output import finite
 from hannes_sim.effect import catalogue
 
 from .add import Addition, add_effects, with_provenance
-from .cli import _after, _check_effects, _executor, _prepared
+from .cli import _after, _before, _check_effects, _executor, _prepared
 from .compare import compare
 from .diagnose import diagnose, effect_sources
 from .diagnosis import Diagnosis
@@ -118,12 +118,12 @@ def work(task: Mapping[str, Any], folder: Path, say: Say) -> None:
     say({"kind": "data", "data": data_used(prepared.features), "notes": notes, "model": prepared.model.name})
     if action == "read":
         return
-    before = compare(prepared)
     found: Diagnosis | Addition | None = None
     if action != "compare":
         _check_effects(prepared, wanted)
         with _executor(task["jobs"], None, False) as executor:
             found = _find(task, prepared, executor, progress)
+    before = _before(prepared, found) if found else compare(prepared)
     comparison = finite(before.to_dict())
     after = finite(_after(prepared, found).to_dict()) if found else None
     answer = finite(found.to_dict()) if found else comparison

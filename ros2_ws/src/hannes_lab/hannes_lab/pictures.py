@@ -108,7 +108,8 @@ def _draw(comparison: Part | None, after: Part | None, diagnosis: Part | None, t
     signals = list(dict.fromkeys(str(o["signal"]) for o in overlays))[:MAX_SIGNALS]
     across = len(conditions) == 1  # then the signals stand side by side
     lines = (1 if across else len(signals)) if overlays else 0
-    maps = [m for m in failure_maps(comparison, after) if m["groups"]]
+    # without repeats there is nothing to hold the errors against
+    maps = [m for m in failure_maps(comparison, after) if m["groups"] and m["scaled"]]
     panels = _panels(error_fall(diagnosis), maps, ranking(diagnosis))
     top, bottom = 2.3 * lines, max((p.height for p in panels), default=0.0)
     height = HEAD + top + (0.35 if lines else 0.0) + (bottom + 0.75 if panels else 0.0)
@@ -161,12 +162,13 @@ def _panels(fall: Part | None, maps: Sequence[Part], ranks: Part | None) -> list
         labels = 0.0 if k else _inches([_row_name(c, s) for c, g in m["groups"].items() for s in g])
         name = f"{m['kind'].capitalize()}: " if len(maps) > 1 else ""
         found = f"{m['fails']} of {m['judged']} fail" if m["judged"] else "error, × repeatability"
+        width = 0.56 * len(m["phases"])
         out.append(
             Panel(
                 f"{name}{found}",
                 labels,
-                0.56 * len(m["phases"]),
-                0.25,
+                width,
+                max(0.25, _inches([f"{name}{found}"]) - width),
                 0.29 * rows,
                 partial(_map, table=m, named=k == 0),
             )

@@ -59,7 +59,7 @@ class Coordinate:
     scale    value = offset + scale z, or offset exp(scale z) if log
     part     True for a part of a whole
     form     True for a shape of an effect of which a usual value is known
-    below    scale of z below 0, if it is another (not if log); 0: it is not
+    below    scale of z below 0 if it is another, or, if log, value = offset (1 + below z) there; 0: as above it
     """
 
     name: str
@@ -90,19 +90,22 @@ class Coordinate:
         return self.below if self.below and z < 0.0 else self.scale
 
     def value(self, z: float) -> float:
-        # A step of the search may go to where no number is; the bounds bring it back.
-        raw = (
-            self.offset * math.exp(min(self.scale * z, 700.0))
-            if self.log
-            else self.offset + self.scale_at(z) * z
-        )
+        if not self.log:
+            raw = self.offset + self.scale_at(z) * z
+        elif self.below and z < 0.0:
+            raw = self.offset * (1.0 + self.below * z)
+        else:
+            # A step of the search may go to where no number is; the bounds bring it back.
+            raw = self.offset * math.exp(min(self.scale * z, 700.0))
         return min(max(raw, self.lower), self.upper)
 
     def z(self, value: float) -> float:
-        if self.log:
-            return float(np.log(value / self.offset)) / self.scale
         away = value - self.offset
-        return away / self.scale_at(away)
+        if not self.log:
+            return away / self.scale_at(away)
+        if self.below and away < 0.0:
+            return away / self.offset / self.below
+        return float(np.log(value / self.offset)) / self.scale
 
     def inside_step(self, z: float, wanted: float | None = None) -> float:
         """Step of a finite difference at z that stays inside the bounds; of the usual length, or as wanted."""
@@ -118,7 +121,9 @@ class Coordinate:
     @property
     def bounds(self) -> tuple[float, float]:
         low = (
-            -np.inf if not np.isfinite(self.lower) or (self.log and self.lower <= 0.0) else self.z(self.lower)
+            -np.inf
+            if not np.isfinite(self.lower) or (self.log and self.lower <= 0.0 and not self.below)
+            else self.z(self.lower)
         )
         high = np.inf if not np.isfinite(self.upper) else self.z(self.upper)
         return low, high

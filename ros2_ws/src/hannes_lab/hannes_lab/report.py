@@ -142,6 +142,7 @@ def render_report(
         "before_name": before_name,
         "after_name": after_name,
         "both": after is not None,
+        "no_finding": text.NO_FINDING,
         "verdict": verdict,
         "sure": how_sure(found),
         "more_effects": max(0, len(found) - SHOWN),
@@ -296,11 +297,14 @@ def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None
             )
     elif len(falls) > 1:
         first = falls[1] if len(falls) > 2 else falls[0]
+        whole = bool((diagnosis or {}).get("greedy"))
+        key, what = ("held_out_conditions", "conditions") if whole else ("held_out", "closures")
         out.append(
             {
-                "value": text.ratio(falls[-1].get("held_out")),
-                "was": text.ratio(first.get("held_out")),
-                "label": f"held-out error, in multiples of the repeatability; before: {first.get('added', '')}",
+                "value": text.ratio(falls[-1].get(key)),
+                "was": text.ratio(first.get(key)),
+                "label": f"error on held-out {what}, in multiples of the repeatability; before: "
+                f"{first.get('added', '')}",
             }
         )
     elif now is not None and text.known(now.get("overall")) is None:

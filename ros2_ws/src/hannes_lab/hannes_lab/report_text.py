@@ -13,6 +13,8 @@ _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 EITHER = "Something is missing, or the nominal model is not that of this machine"
 """How a summary begins where nobody can tell which."""
 
+NO_FINDING = "These effects come nearest. They are no finding, whatever their intervals: more is missing."
+
 
 def known(value: Any) -> float | None:
     """The value as a float; None for what is no finite number (None, NaN, infinity, a text)."""

@@ -43,8 +43,8 @@ REFERENCE_SIZES = {"N.m": 0.05, "rad": 14.57, "V": 12.0, "A": 1.0, "s": 1.0}
 
 NARROW = 0.25
 LEAST = 0.01
-"""Relative tolerances up to the first are on a linear scale, down to this part of the nominal value: an effect that
-adds to the parameter then leaves a straight valley, along which a fit finds its way."""
+"""Relative tolerances up to the first are on a linear scale: an effect that adds to the parameter then leaves a
+straight valley, along which a fit finds its way.  All go down to the second part of the nominal value."""
 
 REMEMBERED = 48
 """Simulations whose signals are kept: those of a whole Jacobian of three trials."""
@@ -64,7 +64,8 @@ class Nuisance:
     apart        sd that the one of a recording may be from the mean over all recordings; beyond, no set of effects is
                  adequate
     effect       effect of the catalogue that is the same thing, if there is one: a value that is far off is that effect
-    below        standard deviation of values less than the mean, on a linear scale, if it is another; 0: it is not
+    below        standard deviation of values less than the mean, on a linear scale, if it is another; if `log`, as a
+                 part of the mean; 0: it is not
     """
 
     name: str
@@ -279,9 +280,13 @@ class PlantRig:
                 f"{self.population}: '{name}' has a relative tolerance (unit \"1\"), but is {mean:g} {unit} in "
                 f"{model.parameters.origin(name)}: give it a value above 0, or a tolerance in {unit!r}."
             )
-        if relative and sd <= NARROW:
+        if not relative:
+            return Nuisance(name, mean, sd, False, scatter, unit)
+        if sd <= NARROW:
             return Nuisance(name, mean, sd * mean, False, scatter * mean, unit, lower=LEAST * mean)
-        return Nuisance(name, mean, sd, relative, scatter, unit)
+        # As a logarithm what is many times too small would be as far off as what is many times too large; but a
+        # friction may be nought.
+        return Nuisance(name, mean, sd, True, scatter, unit, lower=LEAST * mean, below=sd)
 
     def own_error(self, blocks: Sequence[Block], model: Model) -> Array:
         """See Rig."""

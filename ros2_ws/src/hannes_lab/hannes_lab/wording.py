@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from .experiments import VISIBLE, Experiment
 from .falls import WITHOUT_EFFECT, fall_sentence, left_out_errors
 from .fit import Fit, fit
 from .problem import Coordinate, Problem, nuisance_coordinate
-from .report_text import EITHER
+from .report_text import EITHER, listed
 from .rig import Nuisance
 from .search import FAR, PENALTY, Candidate, Search, key_of
 
@@ -68,22 +68,24 @@ def summary(
     bent: str = "",
     only: Sequence[str] = (),
     clock: Clock | None = None,
+    greedy: bool = False,
+    twins: Mapping[str, Sequence[str]] | None = None,
 ) -> str:
     """The verdict in a sentence or two: what is missing, how the error falls, and what to be careful with.
 
     bent  why the set that chance explains is no answer, if it is none
+    twins effects that do the same as a parameter that is far off, by its name
     clock what another clock of the reference would remove
     only  the effects that were looked for, where those are not the whole catalogue
     """
-    fall = fall_sentence(falls)
-    far = _moved_far(best)
+    fall = fall_sentence(falls, greedy)
+    far = _moved_far(best, twins or {})
     if verdict == "nothing":
         explained = (
             f"the model's misfit {best.fit.cost:.0f} is {'below' if best.fit.cost < limits.misfit else 'about'} what "
             f"chance reaches ({limits.misfit:.0f})"
             if choice.adequate
-            else f"the model's error on conditions that were left out is {falls[-1].held_out_conditions:.2f} times the "
-            "repeatability"
+            else "the model is as close to the recordings as they repeat"
         )
         other = choice.idle and f", though {choice.idle}"
         if not other and choice.adequate and choice.ranking:
@@ -101,12 +103,13 @@ def summary(
     if not names and bent:
         return f"{EITHER}: {bent}. {fall}{nearest_sentence(choice)}"
     part = f" Nearest comes {names}, which is not enough." if names else ""
-    why = bent or f"the best model's {shortfall(search, best, limits)}"
+    why = bent or choice.left or f"the best model's {shortfall(search, best, limits)}"
     beyond = (
         f"is not one of those that were looked for ({_listed(only)})" if only else "is not in the catalogue"
     )
     first = f" First look at the clock: {clock.said}." if clock and clock.part >= CLOCK_LEADS else ""
-    return f"Something is missing that {beyond}: {why}.{first}{part} {fall}"
+    start = EITHER if choice.other_model else f"Something is missing that {beyond}"
+    return f"{start}: {why}.{first}{part} {fall}{'' if choice.other_model or bent else far}"
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -233,20 +236,29 @@ def nearest_sentence(choice: Choice) -> str:
     )
 
 
-def _moved_far(best: Candidate) -> str:
+def _moved_far(best: Candidate, twins: Mapping[str, Sequence[str]]) -> str:
     """A sentence on nominal parameters far from their values: this machine's, or an effect of the same form."""
     far = _far_values(best)
     if not far:
         return ""
+    same = "".join(
+        f" With these data {listed(names, 'or')} would do the same as {parameter}."
+        for parameter, names in twins.items()
+    )
     return (
         f" But it takes {far}, far outside the tolerance: is the nominal model that of this machine, or is "
-        "there an effect of the same form?"
+        f"there an effect of the same form?{same}"
     )
+
+
+def far_off(best: Candidate) -> list[Coordinate]:
+    """The nominal parameters that are far from their values."""
+    return [c for c, off in best.fit.off if off > FAR]
 
 
 def _far_values(best: Candidate) -> str:
     """The nominal parameters that are far from their values, with what they would be."""
-    return _said_far(best, [c for c, off in best.fit.off if off > FAR])
+    return _said_far(best, far_off(best))
 
 
 def _far_above(best: Candidate) -> str:
