@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hannes_description.model import Model
+from hannes_lab.adapter import _unlike
 from hannes_lab.own_law import check_own_law
 from hannes_lab.rig import load_rig
 from hannes_sim.factory import make_plant
@@ -461,3 +462,15 @@ def test_a_payload_of_a_condition_is_added_to_what_is_fitted(lab: Lab) -> None:
     assert error(0.5) > 3.0 * as_it_was
     with_model(lab, armature=next(line for line in text.splitlines() if "armature" in line).replace(*less))
     assert error(0.5) == pytest.approx(as_it_was, rel=1e-3)
+
+
+def test_an_encoder_of_the_other_sign_is_said_of_a_step_and_of_volts() -> None:
+    """There the simulated position does not look like its reference: it is held against the simulation itself."""
+    t = np.arange(0.0, 1.0, 1e-3)
+    reference = (t, np.where(t > 0.05, 2.4, 0.0))
+    motion = 2.4 * np.clip((t - 0.05) / 0.8, 0.0, 1.0)
+    said = _unlike("encoder_position", "rad", reference, (t, motion), (t, -1.1 * motion))
+    assert said is not None and "goes against its simulation" in said
+    assert _unlike("encoder_position", "rad", reference, (t, motion), (t, 1.1 * motion)) is None
+    volts = (t, np.full(t.size, -6.0))
+    assert _unlike("encoder_position", "rad", volts, (t, -motion), (t, motion)) is not None

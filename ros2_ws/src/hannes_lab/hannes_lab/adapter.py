@@ -374,14 +374,12 @@ def _unlike(name: str, unit: str, reference: Samples, simulated: Samples, measur
     if name != ENCODER:
         if here > 0.0 and there > 0.0 and not 1.0 / FAR_OFF < there / here < FAR_OFF:
             return f"{name} goes over {there:.3g} {unit}, simulated over {here:.3g}: is it recorded in another unit?"
-        alike = follows(simulated, measured)
-        if alike is not None and alike[1] < AGAINST:
-            return f"{name} goes against its simulation (correlation {alike[1]:.2f}): has it the other sign?"
-        return None
+        return _against(name, simulated, measured)
     ours, theirs = follows(reference, simulated), follows(reference, measured)
     # In closed loop the simulated position follows whatever the parameters are; open loop has another reference.
     if ours is None or theirs is None or ours[1] < -AGAINST or not FOLLOWS[0] < ours[0] < 1.0 / FOLLOWS[0]:
-        return None
+        # a step, or volts: neither follows it
+        return _against(name, simulated, measured)
     if theirs[1] < AGAINST:
         return f"{name} moves against its reference, which the simulated one follows: has it the other sign?"
     if not FOLLOWS[0] < theirs[0] < 1.0 / FOLLOWS[0]:
@@ -390,6 +388,14 @@ def _unlike(name: str, unit: str, reference: Samples, simulated: Samples, measur
             "follows: is it in another unit, or at another shaft?"
         )
     return None
+
+
+def _against(name: str, simulated: Samples, measured: Samples) -> str | None:
+    """That a signal goes against its simulation, if it does."""
+    alike = follows(simulated, measured)
+    if alike is None or alike[1] >= AGAINST:
+        return None
+    return f"{name} goes against its simulation (correlation {alike[1]:.2f}): has it the other sign?"
 
 
 def _check_parts(trial: Trial, where: str) -> None:

@@ -16,7 +16,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.parameters import data_path, read_yaml
 from hannes_sim.factory import is_plant, make_plant
-from hannes_sim.measurement import Sensors, folded_mean, logger, sample_noise
+from hannes_sim.measurement import Sensors, folded_mean, goes_below_nought, logger, sample_noise
 from hannes_sim.objects import GraspObject, named_object
 from hannes_sim.plant import Plant
 from hannes_sim.rollout import Rollout, step_of
@@ -145,7 +145,7 @@ def object_of(trial: Trial) -> GraspObject | None:
 
 
 def sensors_of(trial: Trial) -> dict[str, Any]:
-    """How the current was logged: from the metadata, else guessed from the data (never negative = rectified)."""
+    """How the current was logged: from the metadata, else guessed from the data (rectified if never below nought)."""
     given = trial.options.get("sensors")
     if isinstance(given, Mapping):
         sensors = Sensors.from_dict(given)
@@ -158,7 +158,7 @@ def sensors_of(trial: Trial) -> dict[str, Any]:
         return {"rectified": False, "window": 0.0, "noise": 0.0}
     values = trial.signals["motor_current"][1]
     return {
-        "rectified": bool(values.min() >= -0.01 * max(values.max(), 1e-9)),
+        "rectified": not goes_below_nought(values),
         "window": 0.0,
         "noise": sample_noise(values),
     }
@@ -253,6 +253,12 @@ class HandRig(PlantRig):
     def __init__(self, trials: Sequence[Trial]) -> None:
         super().__init__(trials)
         self._sensors = {trial.name: sensors_of(trial) for trial in self.trials}
+        guessed = [trial.name for trial in self.trials if not tells_logging(trial)]
+        with_current = [t for t in self.trials if t.name in guessed and "motor_current" in t.signals]
+        if any(not self._sensors[trial.name]["rectified"] for trial in with_current):
+            # one recorder: a hand that its springs open shows no sign in some conditions
+            for name in guessed:
+                self._sensors[name]["rectified"] = False
         self._lowest = {
             trial.name: _lowest_kept(*trial.signals["encoder_position"])
             for trial in self.trials
@@ -558,7 +564,7 @@ def _outer_rows(trial: Trial) -> Array | None:
     if not {"motor_current", "encoder_position"} <= set(trial.signals):
         return None
     time, current = trial.signals["motor_current"]
-    signed = float(current.min()) < -0.05 * float(current.max())
+    signed = goes_below_nought(current)
     ticks = np.arange(trial.reference.size) * trial.period
     width = max(1, round(_SMOOTHED / trial.period))
     reference = np.convolve(trial.reference, np.ones(width) / width, mode="same")

@@ -161,6 +161,27 @@ def sample_noise(values: Array) -> float:
     return float(np.median(np.abs(np.diff(values, 2))) / 0.6745 / math.sqrt(6.0))
 
 
+BELOW = 0.01
+"""Part of the largest value by which a log must go below nought to count as signed, beyond its noise."""
+
+AVERAGED = 5
+BEYOND = (6.0, 2.0)
+"""Standard deviations of the noise beyond which a sample, and a mean of so many, is no noise."""
+
+
+def goes_below_nought(values: Array) -> bool:
+    """Whether a logged current has a sign: one sample far below nought, or some together.
+
+    Noise that is added after a current was rectified takes samples below nought too.
+    """
+    if values.size == 0:
+        return False
+    noise, least = sample_noise(values), BELOW * max(float(values.max()), 1e-9)
+    one, some = (-max(least, times * noise) for times in BEYOND)
+    means = np.convolve(values, np.ones(AVERAGED) / AVERAGED, "valid") if values.size > AVERAGED else values
+    return bool(values.min() < one or means.min() < some)
+
+
 THESIS = Sensors()
 """The thesis' log (P17): encoder and rectified current at 30 Hz."""
 
