@@ -161,7 +161,7 @@ def _panels(fall: Part | None, maps: Sequence[Part], ranks: Part | None) -> list
         rows = sum(len(g) for g in m["groups"].values()) + 0.35 * len(m["groups"])
         labels = 0.0 if k else _inches([_row_name(c, s) for c, g in m["groups"].items() for s in g])
         name = f"{m['kind'].capitalize()}: " if len(maps) > 1 else ""
-        found = f"{m['fails']} of {m['judged']} fail" if m["judged"] else "error, × repeatability"
+        found = f"{m['fails']} of {m['judged']} fail" if m["judged"] else "× repeatability"
         width = 0.56 * len(m["phases"])
         out.append(
             Panel(
@@ -175,9 +175,9 @@ def _panels(fall: Part | None, maps: Sequence[Part], ranks: Part | None) -> list
         )
     if ranks:
         rows = ranks["first"]
-        title = "What each effect alone explains" if ranks["excess"] else "Misfit left, × chance"
+        title = "Explained by each alone" if ranks["excess"] else "Misfit left, × chance"
         if ranks["rest"]:
-            title += f" (first {len(rows)} of {len(rows) + len(ranks['rest'])})"
+            title += f" ({len(rows)} of {len(rows) + len(ranks['rest'])})"
         out.append(
             Panel(
                 title,
@@ -287,7 +287,17 @@ def _overlays(
                 pad=4,
             )
             if across or i == len(signals) - 1:
-                lower.set_xlabel("s", loc="right", labelpad=-8)
+                # beside the last number of the axis, not on it
+                lower.annotate(
+                    "s",
+                    (1.0, 0.0),
+                    xytext=(5, -10),
+                    xycoords="axes fraction",
+                    textcoords="offset points",
+                    ha="left",
+                    va="center",
+                    fontsize=8,
+                )
             if i == 0 and j == 0:
                 upper.legend(fontsize=7, frameon=False, loc="best", handlelength=1.5, labelspacing=0.25)
 
