@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from hannes_description.model import Model
-from hannes_lab.hand import HandRig
-from hannes_lab.hide import make_set
-from hannes_lab.trials import make_trial
-from hannes_sim.measurement import SENSORS, goes_below_nought
+from hannes_sim.measurement import goes_below_nought
 
 TIME = np.arange(0.0, 45.0, 1 / 30)
 CLOSURES = 0.33 * np.clip(np.sin(2.0 * np.pi * TIME / 5.6), 0.0, None) ** 0.3
@@ -30,20 +24,3 @@ def test_one_sample_far_below_nought_is_a_sign() -> None:
     braked[100] = -0.2
     assert goes_below_nought(braked + noise)
     assert not goes_below_nought(np.zeros(0)) and not goes_below_nought(np.zeros(3))
-
-
-def test_recordings_of_one_recorder_are_rectified_alike() -> None:
-    """A hand that its springs open may show no sign in one condition, and show it in another."""
-    sensors = replace(SENSORS["bench"], current_noise=0.002)
-    made, _ = make_set(Model.load(), [], seed=5, closures=2, conditions=("slow", "fast"), sensors=sensors)
-    first, second = (replace(make_trial(one), options={}) for one in made)
-    time, current = first.signals["motor_current"]
-    positive = replace(first, signals={**first.signals, "motor_current": (time, np.abs(current))})
-    told = HandRig((positive, second))._sensors
-    assert [told[t.name]["rectified"] for t in (positive, second)] == [False, False]
-    assert HandRig((positive,))._sensors[positive.name]["rectified"]
-    described = replace(positive, options=make_trial(made[0]).options)
-    assert (
-        HandRig((described, second))._sensors[described.name]
-        == HandRig((described,))._sensors[described.name]
-    )

@@ -253,12 +253,6 @@ class HandRig(PlantRig):
     def __init__(self, trials: Sequence[Trial]) -> None:
         super().__init__(trials)
         self._sensors = {trial.name: sensors_of(trial) for trial in self.trials}
-        guessed = [trial.name for trial in self.trials if not tells_logging(trial)]
-        with_current = [t for t in self.trials if t.name in guessed and "motor_current" in t.signals]
-        if any(not self._sensors[trial.name]["rectified"] for trial in with_current):
-            # one recorder: a hand that its springs open shows no sign in some conditions
-            for name in guessed:
-                self._sensors[name]["rectified"] = False
         self._lowest = {
             trial.name: _lowest_kept(*trial.signals["encoder_position"])
             for trial in self.trials
