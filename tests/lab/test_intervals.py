@@ -19,7 +19,7 @@ from hannes_lab.search import FAR, Search
 from hannes_lab.trials import make_trial
 from hannes_lab.twins import imitation, twins
 from hannes_lab.wording import far_off
-from hannes_sim.effect import EffectParameter
+from hannes_sim.effect import EffectParameter, load_effect
 
 SIZE, CONDITIONS = 60, ("slow", "fast", "grasp")
 SLOPE = Coordinate("slope", 0.0, 1.0, False, -np.inf, np.inf, False, 0.1)
@@ -96,8 +96,6 @@ def test_a_strength_that_only_adds_imitates_in_one_direction() -> None:
 def test_the_effect_that_is_the_same_thing_as_what_is_far_off_is_told() -> None:
     """Three quarters more dry friction: seven tolerances, which Coulomb friction would be too."""
     hidden = effect_sources(only=["coulomb_friction"])
-    from hannes_sim.effect import load_effect
-
     entry = load_effect(hidden["coulomb_friction"]).entry({"level": 0.02})
     made, _ = make_set(Model.load(), [entry], seed=33, closures=5, conditions=("fast", "slow"))
     prepared = prepare([make_trial(one) for one in made], Model.load())

@@ -95,7 +95,7 @@ def add_effects(
     intervals = spans_of(search, best, limits, falls)
     return Addition(
         prepared.model,
-        with_provenance(fitted_model(prepared.model, best, search, intervals), prepared, falls),
+        with_provenance(fitted_model(prepared.model, search, best, intervals), prepared, falls),
         found_effects(search, best, intervals, falls),
         falls,
         data_used(prepared.features),

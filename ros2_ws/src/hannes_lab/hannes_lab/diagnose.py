@@ -183,7 +183,7 @@ def diagnose(
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
         given=prepared.model,
-        model=fitted_model(prepared.model, best, search, intervals),
+        model=fitted_model(prepared.model, search, best, intervals),
         values=best.fit.values,
         nominal=answer.null.fit.values,
         greedy=greedy,
@@ -412,7 +412,7 @@ def spans_of(
 
 
 def fitted_model(
-    model: Model, best: Candidate, search: Search, intervals: Mapping[str, tuple[float, float]]
+    model: Model, search: Search, best: Candidate, intervals: Mapping[str, tuple[float, float]]
 ) -> Model:
     """The model with fitted nuisance parameters and effects, as it goes into a file, and the effects' intervals."""
     values, names = best.fit.values, model.names

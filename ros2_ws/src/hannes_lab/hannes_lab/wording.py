@@ -266,7 +266,7 @@ def _far_above(best: Candidate) -> str:
 
     An effect adds to the nominal value.
     """
-    far = [c for c, off in best.fit.off if off > FAR and best.fit.values[c.name] > c.value(0.0)]
+    far = [c for c in far_off(best) if best.fit.values[c.name] > c.value(0.0)]
     return _said_far(
         best, [c for c in far if "@" not in c.name and c.name.split(".")[0] not in _NOT_OF_MACHINE]
     )
