@@ -21,7 +21,7 @@ from typing import Any, ParamSpec
 
 import typer
 from hannes_description.errors import HannesError
-from hannes_description.stopping import Terminated, terminable
+from hannes_description.stopping import Terminated, end_after_feeders, terminable
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
@@ -76,6 +76,7 @@ class Executor:
         """(k, work(shared, key, *items[k])) for every item, as they are done."""
         code = code_hash() if self.dask else None
         parent = None if self.dask else os.getpid()
+        end_after_feeders()
         tasks = [delayed(_numbered)(k, code, parent, work, shared, key, item) for k, item in enumerate(items)]
         options = {"backend": "dask", "client": self.client()} if self.dask else {"backend": "loky"}
         with parallel_config(**options):

@@ -33,6 +33,7 @@ from hannes_description.files import write_whole
 from hannes_description.model import EffectEntry, Model
 from hannes_description.parameters import data_path, read_yaml
 from hannes_description.signals import SIGNALS, STIFFNESS_CLASSES
+from hannes_description.stopping import end_after_feeders
 from hannes_sim.effect import catalogue, effect_of, strength_of
 from hannes_sim.factory import make_plant
 from hannes_sim.measurement import THESIS, Sensors
@@ -690,6 +691,7 @@ def _in_workers(work: Sequence[_Work], jobs: int) -> Iterator[_Made]:
     from joblib.externals.loky import get_reusable_executor
 
     whole = False
+    end_after_feeders()
     warnings.filterwarnings(
         "ignore", message=".*tasks which were still being processed", category=UserWarning
     )
@@ -698,4 +700,5 @@ def _in_workers(work: Sequence[_Work], jobs: int) -> Iterator[_Made]:
         whole = True
     finally:
         if not whole:
-            get_reusable_executor().shutdown(wait=True, kill_workers=True)
+            # a result that came while they were ended may have started others
+            get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=True)
