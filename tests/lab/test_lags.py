@@ -54,6 +54,17 @@ def test_all_signals_of_recordings_that_describe_nothing_leave_it_to_the_clock_t
     assert all("moved" in t.options for t in with_one_clock(late(trials, both), Model.load()))
 
 
+def test_a_signal_that_is_a_little_late_in_recordings_that_describe_nothing_is_fitted(
+    trials: list[Trial],
+) -> None:
+    plain = [
+        replace(t, options={"object": t.options["object"]}) for t in late(trials, {"encoder_position": 0.03})
+    ]
+    found = diagnose(prepare(plain, Model.load()), effect_sources(only=["glove_stiffness", "gear_backlash"]))
+    assert found.verdict == "effects" and [e.name for e in found.effects] == ["glove_stiffness"]
+    assert found.nuisances["log.delay_of_motor_current"]["value"] == pytest.approx(-0.03, abs=0.01)
+
+
 @pytest.mark.parametrize("effect", sorted(catalogue()))
 def test_no_effect_looks_like_another_clock(effect: str) -> None:
     model = Model.load()

@@ -101,7 +101,8 @@ VOLTAGE_WINDOW = "log.voltage_window"
 many log as it was commanded last, from nothing to about one sampling."""
 
 SIGNAL_DELAY = "log.delay_of_"
-"""Beginning of the name of how much later a signal is, s, that was by another clock and moved to that of the others."""
+"""Beginning of the name of how much later a signal is than the others, s: one that was by another clock and moved to
+theirs, or one of a recording that nobody described, where the encoder's delay is that of the reference."""
 
 MOVED = "moved"
 """Option of a trial: the names of those signals."""
@@ -358,10 +359,11 @@ class HandRig(PlantRig):
             Nuisance(f"{REFERENCE_DELAY}@{t.name}", delay, REFERENCE_DELAY_SD, False, unit="s", apart=_APART)
             for t in strange
         ]
-        by_another_clock = dict.fromkeys(name for t in self.trials for name in t.options.get(MOVED, ()))
+        late = [name for t in strange for name in sorted(t.signals, key=_encoder_first)[1:]]
+        late += [name for t in self.trials for name in t.options.get(MOVED, ())]
         out += [
             Nuisance(f"{SIGNAL_DELAY}{name}", 0.0, REFERENCE_DELAY_SD, False, unit="s")
-            for name in by_another_clock
+            for name in dict.fromkeys(late)
         ]
         return out
 
@@ -476,8 +478,9 @@ class HandRig(PlantRig):
             signals["motor_voltage"] = moving_mean(
                 signals["motor_voltage"], 1.0 + values[VOLTAGE_WINDOW] / trial.period
             )
-        for name in trial.options.get(MOVED, ()):
-            signals[name] = later(signals[name], values.get(SIGNAL_DELAY + name, 0.0) / trial.period)
+        for name in trial.signals if strange else trial.options.get(MOVED, ()):
+            if delay := values.get(SIGNAL_DELAY + name, 0.0):
+                signals[name] = later(signals[name], delay / trial.period)
         return signals
 
     def logged(self, run: Rollout, trial: Trial, window: float | None = None) -> dict[str, Array]:
@@ -500,6 +503,10 @@ class HandRig(PlantRig):
             "grip_force": run.grip_force,
             "motor_effort": run.motor_effort,
         }
+
+
+def _encoder_first(signal: str) -> bool:
+    return signal != "encoder_position"
 
 
 def _span(values: Array) -> float:
