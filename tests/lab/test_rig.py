@@ -474,7 +474,7 @@ def test_what_the_data_leave_open() -> None:
     assert named(0.5, 0.0, 100.0, ("presliding_friction",)) == "", "it was there before"
 
 
-@pytest.mark.parametrize("kept", ["one condition", "one closure of each", "of this simulator"])
+@pytest.mark.parametrize("kept", ["one condition", "of this simulator"])
 def test_where_nothing_can_be_held_out_the_smallest_set_that_explains_all_is_looked_for(
     recording: Path, kept: str
 ) -> None:
@@ -484,7 +484,6 @@ def test_where_nothing_can_be_held_out_the_smallest_set_that_explains_all_is_loo
     first = trial.conditions[0]
     closures = {
         "one condition": [c for c in trial.closures if c.condition == first],
-        "one closure of each": [trial.of(condition)[0] for condition in trial.conditions],
         "of this simulator": trial.closures,
     }
     made = rig if kept != "of this simulator" else type("Own", (rig,), {"foreign": False})
@@ -498,3 +497,21 @@ def test_where_nothing_can_be_held_out_the_smallest_set_that_explains_all_is_loo
     if kept != "of this simulator":
         with pytest.raises(HannesError, match="--no-greedy"):
             diagnose(prepared, sources, greedy=True)
+
+
+@pytest.mark.parametrize("floor", [2e-4, 0.05])
+def test_without_repeats_what_was_left_out_decides_whatever_is_taken_for_scatter(
+    recording: Path, floor: float
+) -> None:
+    rig = type("Rough", (load_rig(ADAPTER),), {"floor": floor})
+    (trial,) = rig.read([recording])
+    trial = trial.only([trial.of(condition)[0] for condition in trial.conditions])
+    prepared = prepare([trial], Model.load(recording.parent / "mass.yaml"), rig=rig)
+    texts = set[str]()
+    sources = effect_sources(only=["coulomb_friction", "glove_stiffness"])
+    found = diagnose(prepared, sources, progress=lambda done, total, text: texts.add(text))
+    assert any("held-out conditions" in text for text in texts)
+    assert found.verdict == "effects" and [effect.name for effect in found.effects] == ["coulomb_friction"]
+    assert "No condition was repeated" in found.summary
+    (note,) = (note for note in found.notes if "one closure of" in note)
+    assert f"`floor` ({floor:g} of each signal's span)" in note

@@ -12,6 +12,7 @@ from hannes_sim.effect import load_effect
 from hannes_sim.plant import PlantDiverged
 
 from .chance import chance
+from .delays import in_time
 from .diagnose import fitted_model, found_effects, spans_of
 from .diagnosis import Fall, FoundEffect, both_models
 from .executor import Executor
@@ -83,6 +84,7 @@ def add_effects(
         executor=executor or Executor(),
         progress=progress,
     )
+    prepared, search = in_time(prepared, search)
     best = null = search.null()
     for k, name in enumerate(sources):
         progress(k, len(sources), f"fit with {name}")

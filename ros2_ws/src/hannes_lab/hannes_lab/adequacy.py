@@ -29,6 +29,9 @@ EXTREME = 8.0
 be wrong bends what it has into any curve (a slack of 40 % of the travel and a weight of nine times the usual, for a
 catch at that place)."""
 
+ALONE = 2.0
+"""How many times that a single effect may be: two can bend each other, one that explains all by itself is it."""
+
 DISTORTED, WAVES = 2.5, 3.0
 """Standard deviations, root of the sum of the squares, that the shapes of a periodic effect may be off from what is
 usual of them where fewer than so many of its waves fit into the travel: bent further it stands for a curve that does
@@ -84,11 +87,12 @@ def exaggerated(search: Search, candidate: Candidate) -> str:
     """The effect that is stronger than EXTREME where the model has an error of its own, in words; or empty."""
     if not search.problem.discrepancy:
         return ""
+    most = EXTREME * (ALONE if len(candidate.names) == 1 else 1.0)
     for effect in candidate.names:
         for p in search.effect(effect).parameters:
             name = f"{effect}.{p.name}"
             strength = abs(candidate.fit.z_of(name) or 0.0)
-            if p.vanishing is not None and strength > EXTREME:
+            if p.vanishing is not None and strength > most:
                 return (
                     f"{name} would be {candidate.fit.values[name]:.3g} {p.unit}, {strength:.0f} times what is "
                     "typical: it stands for something else"

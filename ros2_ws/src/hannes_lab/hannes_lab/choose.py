@@ -177,19 +177,15 @@ def choose(
 
 def can_be_held_out(features: Features) -> bool:
     """Whether the error on conditions that are left out can be judged: there are two, and repeats to judge it by."""
-    return len(features.conditions) > 1 and any(block.n > 1 for block in features.blocks)
+    return len(features.conditions) > 1 and features.repeated
 
 
 def must_be_held_out(features: Features) -> None:
-    """Refuse a greedy search where the error on conditions that are left out cannot be judged."""
-    if not can_be_held_out(features):
-        why = (
-            "and there is one condition only: record another speed or load"
-            if len(features.conditions) < 2
-            else "in multiples of the repeatability, and there are no repeats: record each motion more than once"
-        )
+    """Refuse a greedy search where no condition can be left out."""
+    if len(features.conditions) < 2:
         raise HannesError(
-            f"--greedy judges by conditions that took no part in the fit, {why}, or say --no-greedy."
+            "--greedy judges by conditions that took no part in the fit, and there is one condition only: record "
+            "another speed or load, or say --no-greedy."
         )
 
 
@@ -204,27 +200,36 @@ def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects
 def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: float) -> Choice:
     """The choice of a greedy search with whether it is an answer, and what it leaves.
 
-    first, last  error on held-out conditions of the fitted nominal model, and of the chosen one
+    first, last  error on held-out conditions of the fitted nominal model, and of the chosen one, in multiples of the
+                 repeatability, or of the first where there is none
     """
     search, best, left, other_model = choice.search, choice.best, "", False
-    adequate = is_adequate(search, best, choice.limits)
-    repeats = last <= AS_IT_REPEATS or (not best.names and largest_error(search, best) <= AS_IT_REPEATS)
-    enough = repeats or (bool(best.names) and halved(first, last))
+    known = search.problem.features.repeated
+    # Without repeats a guess stands for the scatter, and what it explains says nothing for an effect.
+    adequate = is_adequate(search, best, choice.limits) and (known or not best.names)
+    repeats = known and (
+        last <= AS_IT_REPEATS or (not best.names and largest_error(search, best) <= AS_IT_REPEATS)
+    )
+    enough = repeats or (bool(best.names) and (halved(first, last) if known else last <= HALF * first))
     instead = (disbelieved(search, best) or led_off(null, best)) if best.names else ""
     if enough and instead:
         adequate = enough = False
         other_model = repeats
         left = f"what was added leaves {'no more than the machine repeats' if repeats else 'little'}, but {instead}"
+    elif enough and best.far_off and not known:
+        enough = False
+        left = (
+            "what was added leaves less than half, but takes parameters far outside their tolerances, and nothing was "
+            "repeated that would tell an effect from scatter"
+        )
     elif enough and not adequate and not repeats:
         left = (
             f"the {shortfall(search, best, choice.limits)}: something smaller is left that the "
             "catalogue does not explain"
         )
     elif best.names and not (adequate or enough):
-        left = (
-            "of the error on conditions that were left out, as far as it is above the repeatability, more than half is "
-            "left"
-        )
+        above = ", as far as it is above the repeatability" if known else ""
+        left = f"of the error on conditions that were left out{above}, more than half is left"
     return replace(choice, adequate=adequate, enough=enough, left=left, other_model=other_model)
 
 
@@ -270,10 +275,11 @@ def needed_gain(
     limits = choice.limits
     enough = is_adequate(choice.search, base, limits, room=1.0)
     further = FURTHER if enough and not first else 1.0
+    back = leads_back(base, extended)
     if choice.search.problem.discrepancy:
-        part = 0.0 if leads_back(base, extended) else OWN_ERROR_PART
+        part = 0.0 if back else OWN_ERROR_PART
         return max(OWN_ERROR_CHANCE * limits.gain, part * base.fit.cost) * further
-    return max(limits.gain, 0.0 if enough else WORTHWHILE * base.fit.cost) * further
+    return max(limits.gain, 0.0 if enough or back else WORTHWHILE * base.fit.cost) * further
 
 
 def _may_halve(

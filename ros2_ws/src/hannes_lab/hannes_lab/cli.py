@@ -98,7 +98,7 @@ Greedy = Annotated[
         "--greedy/--no-greedy",
         help="Add effects one after another while the error on held-out conditions falls by 8 %, many small effects "
         "of a real machine, or look for the smallest set that explains all. Default: --greedy for recordings of a "
-        "machine that no model has the form of (a --rig) with repeats of two conditions or more.",
+        "machine that no model has the form of (a --rig) in two conditions or more.",
     ),
 ]
 Signals = Annotated[list[str] | None, typer.Option("--signal", help="Compare only these signals.")]
@@ -437,7 +437,8 @@ def _show_diagnosis(found: Diagnosis, machine: str) -> None:
         console.print("\nThere is no excess misfit that effects could explain: chance explains all of it.")
     elif found.ranking:
         console.print(
-            "\nRanking (part of the excess misfit that each effect explains alone; each parameter costs):"
+            "\nRanking (part of the excess misfit that each effect explains alone, at least: only the best are fitted "
+            "to the end; each parameter costs):"
         )
         for rank in found.ranking[:8]:
             console.print(f"  {100 * rank.explained:5.1f} %  {' + '.join(rank.names)}")

@@ -13,6 +13,7 @@ import numpy as np
 from hannes_description.model import Model
 from numpy.typing import NDArray
 
+from .delays import in_time
 from .depends import Dependence, residual_dependences
 from .errors import SignalError, overall, per_signal, signal_errors
 from .executor import Executor
@@ -179,8 +180,9 @@ def compare(
                 executor=executor or Executor(),
                 progress=progress,
             )
+            prepared, search = in_time(prepared, search)
             found = search.null().fit
-            values, clock = found.values, other_clock(prepared.problem, found)
+            features, values, clock = prepared.features, found.values, other_clock(prepared.problem, found)
             own = [*([clock.said] if clock else []), *held_notes(found)]
     predicted = features.closures(prepared.rig, model, values)
     contact = _contact(prepared, values)

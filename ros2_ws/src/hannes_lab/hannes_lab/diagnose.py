@@ -20,7 +20,6 @@ from .choose import (
     MAX_EFFECTS,
     MAX_GREEDY,
     Choice,
-    can_be_held_out,
     choose,
     choose_greedily,
     cut_to,
@@ -29,12 +28,13 @@ from .choose import (
     needed_gain,
     tied_sets,
 )
+from .delays import in_time
 from .depends import residual_dependences
 from .diagnosis import Diagnosis, Fall, FoundEffect, ParameterEstimate
 from .errors import SignalError
 from .executor import Executor
 from .experiments import separating_experiments
-from .falls import WITHOUT_EFFECT, error_falls, left_out_errors, worth_showing
+from .falls import WITHOUT_EFFECT, error_falls, left_out_errors, relative_errors, worth_showing
 from .features import data_used
 from .fit import Fit
 from .intervals import intervals_of, strain
@@ -102,10 +102,10 @@ def diagnose(
     max_effects  effects that are named at most; MAX_EFFECTS, or MAX_GREEDY, if None
     greedy   add effects one after another as long as the error on held-out conditions falls (greedy.py), instead of
              looking for the smallest set that explains all; None: where no model has the machine's form
-             (Rig.foreign), and there are repeats of two conditions or more
+             (Rig.foreign), and there are two conditions or more
     """
     if greedy is None:
-        greedy = prepared.rig.foreign and can_be_held_out(prepared.features)
+        greedy = prepared.rig.foreign and len(prepared.features.conditions) > 1
     if greedy:
         must_be_held_out(prepared.features)
     if max_effects is None:
@@ -127,6 +127,7 @@ def diagnose(
         executor=executor or Executor(jobs),
         progress=progress,
     )
+    prepared, search = in_time(prepared, search)
     answer = _answer(prepared, search, max_effects, greedy)
     choice, falls, search = answer.choice, answer.falls, answer.choice.search
     best, limits = choice.best, choice.limits
@@ -270,7 +271,12 @@ def _borne_out(choice: Choice, null: Candidate, falls: tuple[Fall, ...]) -> tupl
         best = search.with_spread(search.fit_of(best.names[:-1]))
     if not alone:
         return choice, falls
-    first, last = falls[WITHOUT_EFFECT - 1].held_out_conditions, falls[-1].held_out_conditions
+    deciding = (
+        [fall.held_out_conditions for fall in falls]
+        if search.problem.features.repeated
+        else relative_errors(falls)
+    )
+    first, last = deciding[WITHOUT_EFFECT - 1], deciding[-1]
     fewer = replace(choice, best=best, rivals=(), notes=notes)
     return judged_by_conditions(fewer, null, first, last), falls
 

@@ -104,15 +104,21 @@ def per_signal(features: Features, errors: Iterable[Sequence[SignalError]]) -> d
     return {signal: float(np.sqrt(total[signal] / weight[signal])) for signal in total}
 
 
-def condition_error(features: Features, errors: Iterable[Sequence[SignalError]]) -> float:
+def condition_error(
+    features: Features,
+    errors: Iterable[Sequence[SignalError]],
+    units: Mapping[str, float] | None = None,
+) -> float:
     """Errors on held-out conditions as one number: root mean square over signals, in multiples of the repeatability.
 
     Errors of a signal are averaged over the conditions first, in its unit: a condition that happens to repeat well does
     not count more.
+
+    units   errors by signal, of which they are multiples instead
     """
     error = per_signal(features, errors)
-    repeats = pooled_repeatability(features)
-    ratios = [error[s] / repeats[s] for s in error if repeats[s] > 0.0]
+    one = pooled_repeatability(features) if units is None else units
+    ratios = [error[s] / one[s] for s in error if one.get(s, 0.0) > 0.0]
     return float(np.sqrt(np.mean(np.square(ratios)))) if ratios else float("nan")
 
 

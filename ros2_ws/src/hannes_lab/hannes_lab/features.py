@@ -154,6 +154,11 @@ class Features:
         return tuple(dict.fromkeys(block.condition for block in self.blocks))
 
     @property
+    def repeated(self) -> bool:
+        """Whether anything was recorded more than once, so that there is a repeatability."""
+        return any(block.n > 1 for block in self.blocks)
+
+    @property
     def measured(self) -> Array:
         """Features of the measurement (size,)."""
         return np.concatenate([block.combine(block.measured) for block in self.blocks])

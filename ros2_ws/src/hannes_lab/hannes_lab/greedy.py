@@ -2,7 +2,8 @@
 
 Real residuals are correlated along the motion and never become noise, so that a test against chance does not stop.
 Here each round adds the effect with the least error on conditions that took no part in its fit, and the search stops
-when the next one would lower its mean square by less than a given part.
+when the next one would lower its mean square by less than a given part.  Errors count in multiples of the
+repeatability; where nothing was repeated, of what the fitted nominal model leaves of each signal.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from .adequacy import distorted
-from .errors import condition_error, held_out_condition_errors, signal_errors
+from .errors import condition_error, held_out_condition_errors, per_signal, signal_errors
 from .search import Candidate, Search
 
 JUDGED = 3
@@ -30,6 +31,8 @@ ALIKE = 0.02
 """Candidates whose held-out error is this close to the best, as a part of it, tie with it."""
 
 
+OF_NOMINAL = " times the fitted nominal model's"
+
 LEFT_OPEN = 0.5
 """An effect of which the data leave a parameter open to the end of its range, or all strengths to nought, joins only if
 it leaves this part of the mean square error at most: it stands for something else, or for nothing."""
@@ -40,7 +43,8 @@ class Grown:
     """The effects in the order in which they joined.
 
     first    the first round's candidates, best fit first
-    errors   held-out error of the nominal and after each effect, in multiples of the repeatability
+    errors   held-out error of the nominal and after each effect, in multiples of the repeatability (of the nominal's,
+             where there is none)
     rivals   candidates of the last accepted round that tie with it
     notes    close calls of earlier rounds, and what the next effect would have gained
     """
@@ -52,7 +56,11 @@ class Grown:
     notes: tuple[str, ...]
 
 
-def held_out_error(search: Search, candidate: Candidate, quickly: bool = False) -> float:
+Units = tuple[tuple[str, float], ...]
+"""What the error of each signal counts in, by its name; none: its repeatability."""
+
+
+def held_out_error(search: Search, candidate: Candidate, quickly: bool = False, units: Units = ()) -> float:
     """Error on conditions that took no part in the fit, in multiples of the repeatability; see errors.condition_error.
 
     quickly   the derivatives of the fit to all conditions serve for all refits: leaving one out moves it little
@@ -60,7 +68,18 @@ def held_out_error(search: Search, candidate: Candidate, quickly: bool = False) 
     fit = candidate.fit
     known = {c.name: fit.jacobian[:, j] for j, c in enumerate(fit.coordinates)} if quickly else None
     errors = held_out_condition_errors(search.problem, fit.model, fit.coordinates, fit.z, known=known)
-    return condition_error(search.problem.features, errors.values())
+    return condition_error(search.problem.features, errors.values(), dict(units) or None)
+
+
+def units_of(search: Search, null: Candidate) -> Units:
+    """What errors count in where nothing was repeated: those of the fitted nominal model on held-out conditions."""
+    return () if search.problem.features.repeated else search.once(_units, null, text="nominal: its errors")
+
+
+def _units(search: Search, null: Candidate) -> Units:
+    fit = null.fit
+    errors = held_out_condition_errors(search.problem, fit.model, fit.coordinates, fit.z)
+    return tuple(per_signal(search.problem.features, errors.values()).items())
 
 
 def largest_error(search: Search, candidate: Candidate) -> float:
@@ -84,17 +103,18 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
     """
     best = null
     first: tuple[Candidate, ...] = ()
-    errors = [search.once(held_out_error, null, text="nominal: held-out conditions")]
+    units = units_of(search, null)
+    errors = [1.0 if units else search.once(held_out_error, null, text="nominal: held-out conditions")]
     rivals: tuple[Candidate, ...] = ()
     notes: list[str] = []
     while len(best.names) < max_effects:
-        if errors[-1] <= AS_IT_REPEATS:
+        if not units and errors[-1] <= AS_IT_REPEATS:
             notes.append(
                 f"the held-out error of {errors[-1]:.2f} times the repeatability leaves nothing to look for (up to "
                 f"{AS_IT_REPEATS} it may be chance): the search stops here"
             )
             break
-        if not best.names and (largest := largest_error(search, best)) <= AS_IT_REPEATS:
+        if not (units or best.names) and (largest := largest_error(search, best)) <= AS_IT_REPEATS:
             notes.append(
                 f"in no signal of any condition is the error of the fit more than {largest:.2f} times the "
                 f"repeatability (up to {AS_IT_REPEATS} it may be chance): there is nothing to look for. That on "
@@ -106,20 +126,20 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
         if not singles:
             break
         first = first or tuple(singles)
-        found = _judge(search, singles, text, best, gain, errors[-1])
+        found = _judge(search, singles, text, best, gain, errors[-1], units)
         if not found.falls(errors[-1]) and len(best.names) + 2 <= max_effects:
             # Two effects may be worth it of which neither is alone.
             pairs = search.extend(singles[:JUDGED], list(search.sources), f"{text}, as a pair")
             asked = 1.0 - (1.0 - gain) ** 2
-            two = _judge(search, pairs, text, best, asked, errors[-1]) if pairs else found
+            two = _judge(search, pairs, text, best, asked, errors[-1], units) if pairs else found
             if two.falls(errors[-1]):
                 found = two
         if not found.falls(errors[-1]):
             why = f", for the data leave {found.left_open} open" if found.left_open else ""
             notes.append(
                 f"the next effect, {found.best.names[-1]}, would change the held-out error from {errors[-1]:.2f} to "
-                f"{found.error:.2f}; its mean square must fall by {100 * (1.0 - found.most):.0f} %{why}: the search "
-                "stops here"
+                f"{found.error:.2f}{OF_NOMINAL if units else ''}; its mean square must fall by "
+                f"{100 * (1.0 - found.most):.0f} %{why}: the search stops here"
             )
             break
         if rivals:
@@ -149,7 +169,13 @@ class _Judged:
 
 
 def _judge(
-    search: Search, candidates: Sequence[Candidate], text: str, base: Candidate, gain: float, before: float
+    search: Search,
+    candidates: Sequence[Candidate],
+    text: str,
+    base: Candidate,
+    gain: float,
+    before: float,
+    units: Units,
 ) -> _Judged:
     """The best of the best fits by held-out error; of those that are alike, the one with the fewest parameters.
 
@@ -160,7 +186,7 @@ def _judge(
     """
     sound = [c for c in candidates if not distorted(search, c)] or candidates
     judged = search.each(_polish_in_worker, [(c,) for c in sound[:JUDGED]], f"{text}: polish")
-    held = search.each(held_out_error, [(c, True) for c in judged], f"{text}: held-out conditions")
+    held = search.each(held_out_error, [(c, True, units) for c in judged], f"{text}: held-out conditions")
     left_open = [_left_open(search, candidate, base) for candidate in judged]
     most = [min(LEFT_OPEN, 1.0 - gain) if names else 1.0 - gain for names in left_open]
     scores = [error / math.sqrt(part) for error, part in zip(held, most, strict=True)]
@@ -181,7 +207,7 @@ def _judge(
         )
     ]
     rivals = tuple(judged[k] for k in sorted(others, key=lambda k: held[k]))
-    error = search.once(held_out_error, judged[winner], text=f"{text}: held-out conditions")
+    error = search.once(held_out_error, judged[winner], False, units, text=f"{text}: held-out conditions")
     return _Judged(judged[winner], error, rivals, most[winner], left_open[winner])
 
 

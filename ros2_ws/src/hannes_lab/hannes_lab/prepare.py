@@ -238,7 +238,7 @@ def prepare(
     if single:
         notes.append(
             f"one closure of {', '.join(single)}: how well it repeats is not known, and what the fit takes for scatter "
-            "is a guess from the priors"
+            f"is a guess, from the tolerances and the rig's `floor` ({rig.floor:g} of each signal's span)"
         )
     few = [c for c, n in most.items() if 1 < n < FEW]
     if few:

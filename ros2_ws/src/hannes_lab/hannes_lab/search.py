@@ -469,6 +469,10 @@ class Search:
         """The same search with other nuisance parameters; nothing that was found holds for it."""
         return self._emptied(nuisances=nuisances)
 
+    def on(self, problem: Problem, nuisances: Sequence[Nuisance]) -> Search:
+        """The same search on another problem; nothing that was found holds for it."""
+        return self._emptied(problem=problem, nuisances=nuisances)
+
     def _emptied(self, **changes: Any) -> Search:
         return replace(self, found={}, _nominal={}, _minima={}, _scans={}, _key="", **changes)
 

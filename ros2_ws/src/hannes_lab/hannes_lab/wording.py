@@ -82,16 +82,22 @@ def summary(
     far = _moved_far(best, twins or {})
     if verdict == "nothing":
         explained = (
-            f"the model's misfit {best.fit.cost:.0f} is {'below' if best.fit.cost < limits.misfit else 'about'} what "
-            f"chance reaches ({limits.misfit:.0f})"
+            f"the model's misfit {best.fit.cost:.0f} is {'below' if best.fit.cost < limits.misfit else 'little above'} "
+            f"what chance reaches ({limits.misfit:.0f})"
             if choice.adequate
             else "the model is as close to the recordings as they repeat"
         )
         other = choice.idle and f", though {choice.idle}"
         if not other and choice.adequate and choice.ranking:
             some = f"none of {_listed(only)}" if only else "no effect of the catalogue"
-            other = f", and {some} gains more than chance would"
-        nearest = "" if choice.idle else nearest_sentence(choice)
+            other = f", and {some} " + (
+                "brings the error on conditions that were left out down by enough"
+                if greedy
+                else "gains more than chance would"
+            )
+        if not search.problem.features.repeated:
+            other += "; but nothing was repeated, and a guess stands for the scatter"
+        nearest = "" if choice.idle or greedy else nearest_sentence(choice)
         return f"Nothing is missing: with its own parameters fitted, {explained}{other}. {fall}{far and far + nearest}"
     names = " and ".join(e.title for e in effects)
     if verdict == "effects":
@@ -108,6 +114,11 @@ def summary(
         f"is not one of those that were looked for ({_listed(only)})" if only else "is not in the catalogue"
     )
     first = f" First look at the clock: {clock.said}." if clock and clock.part >= CLOCK_LEADS else ""
+    if not (names or bent or search.problem.features.repeated):
+        return (
+            f"Whether something is missing cannot be told, for nothing was repeated: {why}, but a guess stands for the "
+            f"scatter, and what was looked for brings nothing that was left out nearer by enough.{first} {fall}{far}"
+        )
     start = EITHER if choice.other_model else f"Something is missing that {beyond}"
     return f"{start}: {why}.{first}{part} {fall}{'' if choice.other_model or bent else far}"
 
@@ -128,7 +139,7 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
     if not (best.far_off and choice.search.problem.discrepancy):
         return ""
     if not best.names:
-        far = _far_above(best)
+        far = _far_above(choice.search, best)
         return (
             f"it would explain all only with {far}, far outside the tolerance"
             if far and after.held_out > LEFT
@@ -189,10 +200,12 @@ def idle_sentence(whole: Candidate, part: Candidate, with_all: Fall, with_part: 
     errors = " and ".join(
         f"{b:.2f} instead of {a:.2f} on {what}" for what, a, b in pairs if np.isfinite([a, b]).all()
     )
+    numbers = (
+        f": an error of {errors} that were left out, in multiples of the repeatability" if errors else ""
+    )
     return (
         f"{_further(whole, part)} would fit better (misfit {whole.fit.cost:.0f} instead of {part.fit.cost:.0f}), but "
-        f"not foretell better what took no part in the fit: an error of {errors} that were left out, in multiples of "
-        "the repeatability"
+        f"not foretell better what took no part in the fit{numbers}"
     )
 
 
@@ -261,14 +274,24 @@ def _far_values(best: Candidate) -> str:
     return _said_far(best, far_off(best))
 
 
-def _far_above(best: Candidate) -> str:
+def _far_above(search: Search, best: Candidate) -> str:
     """The same of what a machine keeps (not its controller's and loggers', nor a recording's own) and has too much of.
 
-    An effect adds to the nominal value.
+    An effect adds to the nominal value.  What stands for an effect in each recording (the damping of its object) counts
+    too, where all have too much.
     """
     far = [c for c in far_off(best) if best.fit.values[c.name] > c.value(0.0)]
+    stands_for = {n.name: n.effect for n in search.nuisances if n.effect}
+    names = {c.name for c in far}
+    spared = {effect for name, effect in stands_for.items() if name not in names}
     return _said_far(
-        best, [c for c in far if "@" not in c.name and c.name.split(".")[0] not in _NOT_OF_MACHINE]
+        best,
+        [
+            c
+            for c in far
+            if ("@" not in c.name and c.name.split(".")[0] not in _NOT_OF_MACHINE)
+            or stands_for.get(c.name, "") not in {"", *spared}
+        ],
     )
 
 
@@ -373,11 +396,21 @@ def _ends(search: Search, best: Candidate, effects: Sequence[FoundEffect]) -> li
 def held_notes(found: Fit) -> list[str]:
     """The parameters of the model's file that the end of their range holds."""
     return [
-        f"the fit holds {c.name} at {c.value(float(z)):.4g} {c.unit}, the end of its range in the model's file "
-        f"({c.lower:g} to {c.upper:g}): is that range right, or is there an effect of the same form?"
+        f"the fit holds {c.name} at {c.value(float(z)):.4g} {c.unit}, {_held_at(found, c, float(z))}, or is there an "
+        "effect of the same form?"
         for c, z in zip(found.coordinates, found.z, strict=True)
         if c.nuisance and c.name in found.model.names and any(abs(z - end) < HELD for end in c.bounds)
     ]
+
+
+def _held_at(found: Fit, c: Coordinate, z: float) -> str:
+    """Which end holds a parameter: that of its range in the file, or next to nothing of it, as little as is tried."""
+    given = found.model.parameters[c.name]
+    if abs(z - c.bounds[0]) < HELD and c.lower > given.lower:
+        return "next to nothing, as little as a fit makes of it: is it there at all"
+    return (
+        f"the end of its range in the model's file ({given.lower:g} to {given.upper:g}): is that range right"
+    )
 
 
 def _undescribed(best: Candidate) -> list[str]:
