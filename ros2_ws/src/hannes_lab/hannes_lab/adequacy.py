@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -159,18 +160,20 @@ def distorted(search: Search, candidate: Candidate) -> str:
     return ""
 
 
-def led_off(base: Candidate, best: Candidate) -> str:
+def led_off(base: Candidate, best: Candidate, by: Sequence[str] = ()) -> str:
     """The well-known parameter that effects take far off and that is near its nominal value without them, in words.
 
     They replace what the model had.  Empty if there is none.
+
+    by   the effects that do, if not all of them
     """
     known = best.fit.model.names
     for c, off in best.fit.off:
         if off > PULLED and not c.wide and c.name in known and abs(base.fit.z_of(c.name) or 0.0) < FAR:
             return (
-                f"{' and '.join(best.names)} would take {c.name} to {best.fit.values[c.name]:.3g} {c.unit} instead of "
-                f"{c.value(0.0):.3g}, {off:.0f} times its tolerance off, where it is not without: what is missing "
-                "has another form"
+                f"{' and '.join(by or best.names)} would take {c.name} to {best.fit.values[c.name]:.3g} {c.unit} "
+                f"instead of {c.value(0.0):.3g}, {off:.0f} times its tolerance off, where it is not without: what is "
+                "missing has another form"
             )
     return ""
 

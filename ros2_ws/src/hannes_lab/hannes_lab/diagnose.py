@@ -13,7 +13,7 @@ from hannes_description.model import EffectEntry, Model
 from hannes_sim.effect import catalogue, effect_source, load_effect
 from numpy.typing import NDArray
 
-from .adequacy import in_the_law, is_adequate, leads_back
+from .adequacy import in_the_law, is_adequate, leads_back, led_off
 from .chance import Chance, chance
 from .choose import (
     EACH_TAKES,
@@ -293,6 +293,8 @@ def _idle_at_the_end(
     before, after = falls[-2].held_out, falls[-1].held_out
     if after > before:
         return f"the error on held-out closures rises with it from {before:.3g} to {after:.3g} times the repeatability"
+    if len(found.names) > 1 and (why := led_off(search.fit_of(found.names[:-1]), found, found.names[-1:])):
+        return why
     before, after = falls[-2].held_out_conditions, falls[-1].held_out_conditions
     if alone and after**2 > (1.0 - EACH_TAKES) * before**2:
         return (
