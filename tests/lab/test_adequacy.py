@@ -46,6 +46,8 @@ def test_effects_that_take_a_known_parameter_far_off_replace_what_the_model_had(
     base = candidate((dry, -1.3), (wire, 0.0))
     said = led_off(base, candidate((dry, -9.0), (wire, 0.0)))
     assert said.startswith("cogging would take friction.coulomb to") and "9 times its tolerance off" in said
+    last = led_off(base, candidate((dry, -9.0), (wire, 0.0)), ["current_sensor"])
+    assert last.startswith("current_sensor would take friction.coulomb to")
     assert not led_off(base, candidate((dry, -3.5), (wire, 6.0)))
     assert not led_off(candidate((dry, -3.5)), candidate((dry, -9.0))), "it was off before"
 
@@ -95,6 +97,13 @@ def test_no_effect_far_stronger_than_usual_is_believed_of_another_machine() -> N
     assert not said(slack=3.9, stiffness=0.015)
     assert said(slack=4.8).startswith("wire_slack.slack would be 4.8 rad, 10 times what is typical")
     assert said(slack=0.5, stiffness=0.002, hardening=5e-5).startswith("glove_stiffness.hardening would be")
+
+    def alone(slack: float) -> str:
+        found = candidate((of["wire_slack.slack"], of["wire_slack.slack"].z(slack)))
+        return exaggerated(search, replace(found, names=("wire_slack",)))
+
+    assert not alone(4.8), "one effect that explains all by itself may be stronger than one of two"
+    assert "16 times what is typical" in alone(8.2)
 
 
 def test_how_the_law_of_another_machine_sets_in_is_told_by_its_way() -> None:

@@ -30,7 +30,7 @@ class Made:
 
     problem: Any = SimpleNamespace(
         discrepancy=True,
-        features=SimpleNamespace(conditions=("slow", "fast"), blocks=(SimpleNamespace(n=5),)),
+        features=SimpleNamespace(conditions=("slow", "fast"), blocks=(SimpleNamespace(n=5),), repeated=True),
     )
     slow, sources = False, ("a", "b")
 

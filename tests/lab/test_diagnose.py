@@ -292,6 +292,16 @@ def test_effects_that_bend_the_model_and_leave_most_of_the_error_are_no_answer(g
     assert not alone(search, 4.0, 2.0), "the model has no error of its own there"
 
 
+def test_an_effect_that_is_the_same_as_a_parameter_far_off_is_named_beside_another() -> None:
+    """Beside a breakaway friction the dry friction was nine tolerances off, which was "unknown"."""
+    hidden = [strength_of("coulomb_friction", 2.0), strength_of("stribeck_friction", 1.0)]
+    recordings, _ = make_set(Model.load(), hidden, seed=6124, closures=4, conditions=QUICK, sensors="bench")
+    prepared = prepare([make_trial(r) for r in recordings], Model.load())
+    found = run(prepared, only=["coulomb_friction", "stribeck_friction", "gravity"])
+    assert found.verdict == "effects"
+    assert {effect.name for effect in found.effects} == {"coulomb_friction", "stribeck_friction"}
+
+
 def test_where_the_model_has_an_error_of_its_own_more_ties(gloved: Search) -> None:
     search = gloved
     about = copy_of(search, problem=replace(search.problem, discrepancy=(OWN_ERROR,)))

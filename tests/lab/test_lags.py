@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.hand import outer_loop
 from hannes_lab.hide import make_set
-from hannes_lab.lags import lags, with_one_clock
+from hannes_lab.lags import lags, lags_to_voltage, with_one_clock
 from hannes_lab.prepare import prepare
 from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import catalogue, strength_of
@@ -72,3 +73,51 @@ def test_no_effect_looks_like_another_clock(effect: str) -> None:
     found = lags([make_trial(r) for r in recordings], model)
     assert set(found) == {"encoder_position", "motor_current"}
     assert not any(lag.clear for lag in found.values()), found
+
+
+@pytest.mark.parametrize("effect", sorted(catalogue()))
+def test_no_effect_looks_like_another_clock_than_the_voltage(effect: str) -> None:
+    recordings, _ = make_set(
+        Model.load(), [strength_of(effect, 2.0)], seed=7, closures=2, conditions=QUICK, sensors="bench"
+    )
+    assert lags_to_voltage([make_trial(r) for r in recordings]) == {}
+
+
+@pytest.mark.parametrize(
+    ("by", "found"),
+    [
+        ({"motor_current": 0.025}, {"motor_current": 0.025}),
+        ({"encoder_position": -0.03}, {"encoder_position": -0.03}),
+        ({"encoder_position": 0.03, "motor_current": 0.03}, {}),
+        ({"motor_current": 0.008}, {}),
+    ],
+    ids=["current", "encoder", "both: the command is", "as little as a model may be off"],
+)
+def test_a_voltage_tells_the_time_of_current_and_encoder(
+    by: Mapping[str, float], found: Mapping[str, float]
+) -> None:
+    recordings, _ = make_set(
+        Model.load(),
+        [strength_of("glove_stiffness", 1.0)],
+        seed=102,
+        closures=3,
+        conditions=QUICK,
+        sensors="bench",
+    )
+    trials = late([make_trial(r) for r in recordings], by)
+    assert lags_to_voltage(trials) == pytest.approx(found, abs=0.0051)
+    notes = [
+        note
+        for trial in with_one_clock(trials, Model.load())
+        for note in trial.notes
+        if "another clock" in note
+    ]
+    assert len(notes) == len(QUICK) * len(found)
+
+
+def test_an_outer_loop_is_read_off_the_recordings_only_where_they_show_it(trials: list[Trial]) -> None:
+    """Fast closures with a rectified current at 30 Hz gave fourteen times the gain."""
+    assert outer_loop(trials) is None
+    recordings, _ = make_set(Model.load(), [], seed=102, closures=3, conditions=("slow",), sensors="bench")
+    loop = outer_loop([make_trial(r) for r in recordings])
+    assert loop is not None and loop.kp == pytest.approx(Model.load().parameters.value("control.kp"), rel=0.3)
