@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.compare import compare
 from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.join import join_trials
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.rig import load_rig
 from hannes_lab.trials import Closure, Trial
@@ -118,7 +118,7 @@ def test_recordings_of_one_file_are_told_by_their_names(rig: type) -> None:
     assert any("3 recordings repeat one condition and are taken together (x0, x1, x2)" in n for n in notes)
 
 
-def test_without_repeats_conditions_decide_what_is_shown_and_greedy_is_not_advised(rig: type) -> None:
+def test_without_repeats_what_brings_left_out_conditions_no_nearer_is_no_finding(rig: type) -> None:
     far, near = moves(rig, "far", 0.1, 0.0, 1), moves(rig, "near", 0.02, 0.0, 1)
     bent = []
     for trial in far + near:
@@ -129,8 +129,10 @@ def test_without_repeats_conditions_decide_what_is_shown_and_greedy_is_not_advis
     sources = effect_sources(only=["coulomb_friction"])
     answer = diagnose(found, sources)
     assert answer.verdict == "unknown" and not any("--greedy" in note for note in answer.notes)
-    with pytest.raises(HannesError, match="there are no repeats: record each motion more than once"):
-        diagnose(found, sources, greedy=True)
+    assert answer.effects == ()
+    assert answer.summary.startswith(
+        "Whether something is missing cannot be told, for nothing was repeated: "
+    )
 
 
 def test_a_travel_unlike_that_of_the_adapter_is_said(rig: type) -> None:
@@ -183,3 +185,13 @@ def test_a_recorded_command_is_replayed_without_a_controller(rig: type) -> None:
     errors = {e.signal: e.rmse for e in compare(found).errors}
     assert errors["drive_force"] < 1e-9 and errors["encoder_position"] < 1e-3
     assert not any("reference, which the simulated one" in note for note in found.notes)
+
+
+def test_closures_of_a_condition_in_trials_of_several_are_said_to_be_no_repeats(rig: type) -> None:
+    one, two = (
+        replace(t, closures=(*t.closures, replace(t.closures[0], condition=f"only in {t.name}")))
+        for t in moves(rig, "up", 0.05, 0.0, 2, fresh=True)
+    )
+    (note,) = (n for t in join_trials([one, two]) for n in t.notes if "not taken for repeats" in n)
+    assert str(note).startswith("up: in several trials (up0, up1) that hold other conditions too")
+    assert not any("not taken for repeats" in n for t in join_trials([one]) for n in t.notes)

@@ -86,9 +86,32 @@ def join_trials(trials: Sequence[Trial]) -> list[Trial]:
         for condition, of_one in apart.items()
         if len(of_one) > 1
     ]
+    said += _with_others(joined)
     first, *others = joined
     told = tuple(OfAll(note) for note in said if note not in first.notes)
     return [replace(first, notes=(*first.notes, *told)), *others]
+
+
+def _with_others(trials: Sequence[Trial]) -> list[str]:
+    """A sentence on conditions of one closure each that trials of several share: they are no repeats of each other."""
+    places: dict[str, list[Trial]] = {}
+    for trial in trials:
+        for condition in trial.conditions:
+            places.setdefault(condition, []).append(trial)
+    shared = {
+        condition: own
+        for condition, own in places.items()
+        if len(own) > 1
+        and any(len(trial.conditions) > 1 for trial in own)
+        and all(len(trial.of(condition)) == 1 for trial in own)
+    }
+    if not shared:
+        return []
+    names = ", ".join(dict.fromkeys(trial.name for own in shared.values() for trial in own))
+    return [
+        f"{', '.join(shared)}: in several trials ({names}) that hold other conditions too, so that these are not taken "
+        "for repeats; put all closures into one trial, or each condition into trials of its own"
+    ]
 
 
 def _why_apart(a: Trial, b: Trial) -> str:
