@@ -119,7 +119,8 @@ def summary(
             f"Whether something is missing cannot be told, for nothing was repeated: {why}, but a guess stands for the "
             f"scatter, and what was looked for brings nothing that was left out nearer by enough.{first} {fall}{far}"
         )
-    start = EITHER if choice.other_model else f"Something is missing that {beyond}"
+    either = choice.other_model or not search.problem.features.repeated
+    start = EITHER if either else f"Something is missing that {beyond}"
     return f"{start}: {why}.{first}{part} {fall}{'' if choice.other_model or bent else far}"
 
 
