@@ -87,7 +87,9 @@ def test_diagnose_add_and_report(
         capsys=capsys,
         monkeypatch=monkeypatch,
     )
-    assert code == 0 and json.loads(out)["overall"] < 1.3
+    compared = json.loads(out)
+    assert code == 0 and compared["overall"] < 1.3
+    assert compared["values"]["hand.stiffness"] > 0.0
 
 
 def test_hide_keeps_the_truth_away_from_the_bags(

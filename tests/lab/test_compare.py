@@ -12,6 +12,7 @@ from hannes_lab.features import Features
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.trials import Trial, make_trial
+from hannes_sim.effect import strength_of
 
 
 @pytest.fixture(scope="module")
@@ -72,3 +73,16 @@ def test_an_offset_depends_on_nothing_and_without_an_encoder_place_and_speed_are
     assert set(shares(lambda c: 0.1 * c**2, features, "motor_current")) == {"load", "time"}
     without = shares(lambda c: 0.1 * c**2, features, "encoder_position")
     assert set(without) == {"position", "velocity", "direction", "time"}, "no signal tells the load"
+
+
+def test_what_a_fit_took_where_is_said() -> None:
+    recordings, _ = make_set(
+        Model.load(), [strength_of("glove_stiffness", 1.0)], seed=5, closures=5, conditions=("fast",)
+    )
+    prepared = prepare([make_trial(recordings[0])], Model.load())
+    assert compare(prepared).values == {}
+    found = compare(prepared, fitted=True)
+    (note,) = (note for note in found.notes if note.startswith("the fit took "))
+    value = found.values["hand.stiffness"]
+    assert value > 0.002 and f"hand.stiffness {value:.3g} N.m/rad instead of 0.0015 (" in note
+    assert found.to_dict()["values"] == found.values

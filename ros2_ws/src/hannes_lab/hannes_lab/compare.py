@@ -21,7 +21,7 @@ from .features import Block, Features, data_used
 from .phases import METRICS, PHASES, metrics, phase_of
 from .prepare import FEW, Prepared
 from .search import Progress, Search, silent
-from .wording import held_notes, other_clock
+from .wording import held_notes, moved_notes, other_clock
 
 Array = NDArray[np.float64]
 
@@ -123,6 +123,7 @@ class Comparison:
 
     overall    root mean square of the errors in multiples of the repeatability; NaN where nothing was repeated
     by_signal  root mean square error of each signal over the conditions, in its unit
+    values     parameters that were fitted, by name, in their units
     """
 
     model: Model
@@ -136,6 +137,7 @@ class Comparison:
     data: tuple[Mapping[str, Any], ...]
     notes: tuple[str, ...]
     by_signal: Mapping[str, float] = field(default_factory=dict)
+    values: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -143,6 +145,7 @@ class Comparison:
             "fitted": self.fitted,
             "overall": self.overall,
             "by_signal": dict(self.by_signal),
+            "values": dict(self.values),
             "errors": [e.to_dict() for e in self.errors],
             "cells": [c.to_dict() for c in self.cells],
             "overlays": [o.to_dict() for o in self.overlays],
@@ -183,7 +186,7 @@ def compare(
             prepared, search = in_time(prepared, search)
             found = search.null().fit
             features, values, clock = prepared.features, found.values, other_clock(prepared.problem, found)
-            own = [*([clock.said] if clock else []), *held_notes(found)]
+            own = [*([clock.said] if clock else []), *moved_notes(found), *held_notes(found)]
     predicted = features.closures(prepared.rig, model, values)
     contact = _contact(prepared, values)
     labels = [_labels(features, block, contact) for block in features.blocks]
@@ -206,6 +209,7 @@ def compare(
         data_used(features),
         (*prepared.notes, *own),
         per_signal(features, [of_blocks]),
+        values if fitted else {},
     )
 
 

@@ -40,6 +40,9 @@ explanation: clean machines of others have not been seen to be."""
 
 _NOT_OF_MACHINE = ("control", "log", "encoder", "object")
 
+MOVED_BY = 1.0
+"""Tolerances from which a fitted parameter is worth a line of `compare --fitted`."""
+
 UNUSUAL = 1.5
 """Standard deviations of a wide prior from which a parameter that stands for an effect is worth a note."""
 
@@ -297,7 +300,11 @@ def _far_above(search: Search, best: Candidate) -> str:
 
 
 def _said_far(best: Candidate, far: Sequence[Coordinate]) -> str:
-    values, off = best.fit.values, {c.name: z for c, z in best.fit.off}
+    return _said_off(best.fit, far)
+
+
+def _said_off(found: Fit, far: Sequence[Coordinate]) -> str:
+    values, off = found.values, {c.name: z for c, z in found.off}
     return ", ".join(
         f"{c.name} {values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g} ({off[c.name]:.0f} tolerances)"
         for c in far
@@ -392,6 +399,12 @@ def _ends(search: Search, best: Candidate, effects: Sequence[FoundEffect]) -> li
                     f"range ({c.lower:g} to {c.upper:g}): the true value may lie beyond it{wider}"
                 )
     return out + held_notes(best.fit)
+
+
+def moved_notes(found: Fit) -> list[str]:
+    """The parameters that a fit took away from their nominal values, farthest first."""
+    moved = [c for c, off in found.off if off >= MOVED_BY]
+    return [f"the fit took {_said_off(found, moved)}"] if moved else []
 
 
 def held_notes(found: Fit) -> list[str]:
