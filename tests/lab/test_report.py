@@ -18,6 +18,8 @@ from hannes_lab.pictures import write_picture
 from hannes_lab.report import embedded_json, render_report, write_report
 from hannes_lab.report_next import next_step
 from hannes_lab.report_text import (
+    CANNOT_TELL,
+    EITHER,
     interval,
     number,
     percent,
@@ -303,8 +305,8 @@ def page_of(**parts: Any) -> Page:
     return page
 
 
-def test_the_headline_does_not_say_what_nobody_can_tell() -> None:
-    either = "Something is missing, or the nominal model is not that of this machine"
+@pytest.mark.parametrize("either", [EITHER, CANNOT_TELL])
+def test_the_headline_does_not_say_what_nobody_can_tell(either: str) -> None:
     told = {
         **make_diagnosis("unknown"),
         "summary": f"{either}: it would explain all only with hand.stiffness.",

@@ -228,8 +228,9 @@ def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | No
     elif kind == "effects":
         headline = lacking(diagnosis, names)
     elif kind == "unknown":
-        either = str((diagnosis or {}).get("summary", "")).startswith(text.EITHER)
-        headline = f"{text.EITHER}." if either else "Something is missing that the catalogue does not hold."
+        summary = str((diagnosis or {}).get("summary", ""))
+        begins = next((b for b in (text.EITHER, text.CANNOT_TELL) if summary.startswith(b)), None)
+        headline = f"{begins or 'Something is missing that the catalogue does not hold'}."
     elif kind == "added":
         headline = f"The model has {text.listed(names)} now."
     elif kind != "comparison":

@@ -13,6 +13,9 @@ _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 EITHER = "Something is missing, or the nominal model is not that of this machine"
 """How a summary begins where nobody can tell which."""
 
+CANNOT_TELL = "Whether something is missing cannot be told"
+"""How one begins where nothing was repeated, and nothing brings what was left out nearer."""
+
 NO_FINDING = "These effects come nearest. They are no finding, whatever their intervals: more is missing."
 
 

@@ -16,7 +16,7 @@ from .experiments import VISIBLE, Experiment
 from .falls import WITHOUT_EFFECT, fall_sentence, left_out_errors
 from .fit import Fit, fit
 from .problem import Coordinate, Problem, nuisance_coordinate
-from .report_text import EITHER, listed
+from .report_text import CANNOT_TELL, EITHER, listed
 from .rig import Nuisance
 from .search import FAR, PENALTY, Candidate, Search, key_of
 
@@ -119,7 +119,7 @@ def summary(
     first = f" First look at the clock: {clock.said}." if clock and clock.part >= CLOCK_LEADS else ""
     if not (names or bent or search.problem.features.repeated):
         return (
-            f"Whether something is missing cannot be told, for nothing was repeated: {why}, but a guess stands for the "
+            f"{CANNOT_TELL}, for nothing was repeated: {why}, but a guess stands for the "
             f"scatter, and what was looked for brings nothing that was left out nearer by enough.{first} {fall}{far}"
         )
     either = choice.other_model or not search.problem.features.repeated
