@@ -421,6 +421,10 @@ def test_what_to_run_next(verdict: str, command: str, then: str | None) -> None:
 def test_ties_that_nothing_separates_give_no_command() -> None:
     diagnosis = make_diagnosis("effects")
     diagnosis["experiments"][0]["distance"] = 0.1
+    told = next_step("unknown", {"summary": f"{CANNOT_TELL}, for nothing was repeated"}, "hannes diagnose b")
+    assert (
+        told is not None and told["text"].startswith("Record each motion five times") and not told["command"]
+    )
     step = next_step("effects", diagnosis, "hannes diagnose b")
     assert step is not None and not step["command"] and "No experiment" in step["text"]
 

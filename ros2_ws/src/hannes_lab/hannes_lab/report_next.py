@@ -43,6 +43,11 @@ def next_step(kind: str, diagnosis: Part | None, command: str) -> dict[str, str]
         words = ["hannes", "diagnose", *("--report" if w == "--out" else w for w in words[2:])]
     if kind == "effects":
         return {"text": "Write the model with it to a file", "command": shlex.join([*words, "--add"])}
+    if str((diagnosis or {}).get("summary", "")).startswith(text.CANNOT_TELL):
+        return {
+            "text": "Record each motion five times or more: only repeats tell what is scatter",
+            "command": "",
+        }
     return {
         "text": "Write down what you suspect as an effect of your own, and let it take part",
         "command": shlex.join([*words, "--effect", OWN_EFFECT]),
