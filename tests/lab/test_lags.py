@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 from hannes_description.model import Model
+from hannes_lab.compare import compare
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.hand import outer_loop
 from hannes_lab.hide import make_set
@@ -67,6 +68,9 @@ def test_a_signal_that_is_a_little_late_in_recordings_that_describe_nothing_is_f
     (moved,) = re.findall(r"motor_current is ([\d.]+) s earlier than the encoder", "\n".join(found.notes))
     rest = found.nuisances["log.delay_of_motor_current"]["value"]
     assert rest - float(moved) == pytest.approx(-0.03, abs=0.005)
+    assert found.moved is not None
+    after = compare(replace(found.moved, model=found.model), values=found.values)
+    assert after.overall < 1.5, "a report compares with what was moved"
 
 
 @pytest.mark.parametrize("effect", sorted(catalogue()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from hannes_description.errors import HannesError
@@ -28,6 +28,7 @@ class Addition:
 
     given   the model to which they were added
     nominal  its values, fitted without them
+    moved   see Diagnosis
     """
 
     given: Model
@@ -38,6 +39,7 @@ class Addition:
     notes: tuple[str, ...]
     values: Mapping[str, float]
     nominal: Mapping[str, float]
+    moved: Prepared | None = field(default=None, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -84,7 +86,8 @@ def add_effects(
         executor=executor or Executor(),
         progress=progress,
     )
-    prepared, search = in_time(prepared, search)
+    given = prepared
+    prepared, search = in_time(given, search)
     best = null = search.null()
     for k, name in enumerate(sources):
         progress(k, len(sources), f"fit with {name}")
@@ -104,6 +107,7 @@ def add_effects(
         prepared.notes,
         best.fit.values,
         null.fit.values,
+        None if prepared is given else prepared,
     )
 
 

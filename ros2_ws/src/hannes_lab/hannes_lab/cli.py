@@ -406,12 +406,12 @@ def _before(prepared: Prepared, found: Diagnosis | Addition) -> Comparison:
     """The given model beside the recordings: fitted, where something was added to it, so that this is all they differ
     in."""
     return compare_model(
-        prepared, values=found.nominal if found.effects else None, fitted=bool(found.effects)
+        found.moved or prepared, values=found.nominal if found.effects else None, fitted=bool(found.effects)
     )
 
 
 def _after(prepared: Prepared, found: Diagnosis | Addition) -> Comparison:
-    return compare_model(replace(prepared, model=found.model), values=found.values)
+    return compare_model(replace(found.moved or prepared, model=found.model), values=found.values)
 
 
 def _report_of(path: Path, prepared: Prepared, found: Diagnosis | Addition) -> None:

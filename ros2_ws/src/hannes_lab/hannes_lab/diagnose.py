@@ -127,7 +127,9 @@ def diagnose(
         executor=executor or Executor(jobs),
         progress=progress,
     )
-    prepared, search = in_time(prepared, search)
+    given = prepared
+    prepared, search = in_time(given, search)
+    moved = None if prepared is given else prepared
     answer = _answer(prepared, search, max_effects, greedy)
     choice, falls, search = answer.choice, answer.falls, answer.choice.search
     best, limits = choice.best, choice.limits
@@ -188,6 +190,7 @@ def diagnose(
         values=best.fit.values,
         nominal=answer.null.fit.values,
         greedy=greedy,
+        moved=moved,
     )
 
 

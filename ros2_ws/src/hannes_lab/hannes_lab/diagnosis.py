@@ -15,6 +15,7 @@ from .errors import (
     SignalError,
 )
 from .experiments import Experiment
+from .prepare import Prepared
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,7 @@ class Diagnosis:
     model   the same with what was found, fitted; `values` are those of all that was free
     nominal  those of the given model, fitted without effects
     greedy  the error on conditions that were left out decided
+    moved   the recordings with signals moved back to one clock, prepared anew; None where all were in time
     """
 
     verdict: str
@@ -141,6 +143,7 @@ class Diagnosis:
     values: Mapping[str, float]
     nominal: Mapping[str, float]
     greedy: bool = False
+    moved: Prepared | None = field(default=None, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         falls = self.falls
