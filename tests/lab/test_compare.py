@@ -82,7 +82,7 @@ def test_what_a_fit_took_where_is_said() -> None:
     prepared = prepare([make_trial(recordings[0])], Model.load())
     assert compare(prepared).values == {}
     found = compare(prepared, fitted=True)
-    (note,) = (note for note in found.notes if note.startswith("the fit took "))
+    (note,) = (note for note in found.notes if note.startswith("the fit has "))
     value = found.values["hand.stiffness"]
     assert value > 0.002 and f"hand.stiffness {value:.3g} N.m/rad instead of 0.0015 (" in note
     assert found.to_dict()["values"] == found.values

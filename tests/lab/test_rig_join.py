@@ -193,5 +193,5 @@ def test_closures_of_a_condition_in_trials_of_several_are_said_to_be_no_repeats(
         for t in moves(rig, "up", 0.05, 0.0, 2, fresh=True)
     )
     (note,) = (n for t in join_trials([one, two]) for n in t.notes if "not taken for repeats" in n)
-    assert str(note).startswith("up: in several trials (up0, up1) that hold other conditions too")
+    assert str(note).startswith("up: in several trials (up0, up1) of which some hold other conditions too")
     assert not any("not taken for repeats" in n for t in join_trials([one]) for n in t.notes)

@@ -448,7 +448,7 @@ def test_the_model_as_it_is_is_fitted_from_several_starts_where_little_is_known(
     assert starts[:2] == [{}, {"encoder.homing": 1.0}]
     assert len(starts) > 4 and all(set(one) == wide for one in starts[2:])
     assert {"control.kp", "wire.stiffness"} <= wide and not wide & {"motor.kt", "friction.coulomb"}
-    costs = [search._begin(start).cost for start in starts]
+    costs = [search.begun_at(start).cost for start in starts]
     assert max(costs) > 1.03 * min(costs), "these data have one minimum, and show nothing"
     assert search.null().fit.cost <= min(costs)
 

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from .fit import fit
-from .hand import SIGNAL_DELAY, HandRig
+from .hand import SIGNAL_DELAY, HandRig, is_described
 from .lags import moved_back
 from .prepare import Prepared, prepare
-from .search import WHOLE, Search
+from .search import Search
 
-MUCH = 0.8
-"""Part of the fitted nominal model's cost that delays must leave at most."""
+MUCH, EACH = 0.8, 9.0
+"""Part of the fitted nominal model's cost that delays must leave at most, and the least that each must take of it."""
+
+LEAST = 0.005
+"""s from which a signal is moved."""
 
 
 def in_time(prepared: Prepared, search: Search) -> tuple[Prepared, Search]:
@@ -24,22 +26,35 @@ def in_time(prepared: Prepared, search: Search) -> tuple[Prepared, Search]:
 
     Only a hand's recordings may be by several clocks; a search through a surrogate is left as it is.
     """
-    rig = prepared.rig
-    delays = rig.delays() if isinstance(rig, HandRig) and not search.slow else []
+    rig, signals = prepared.rig, list(dict.fromkeys(block.signal for block in prepared.features.blocks))
+    if type(rig) is not HandRig or search.slow:
+        return prepared, search
+    anchor, delays = rig.delays(signals)
     if not delays:
         return prepared, search
-    without = search.null().fit
+
+    def needed(without: float, with_them: float) -> bool:
+        return with_them <= min(MUCH * without, without - EACH * len(delays))
+
     found = search.with_nuisances([*search.nuisances, *delays]).null().fit
-    if found.cost > MUCH * without.cost:
+    if not needed(search.null().fit.cost, found.cost):
         return prepared, search
     # The fit without them may only have ended in a worse valley.
-    start = {name: z for name, z in found.point.items() if name in without.point}
-    again = fit(search.problem, search.model, without.coordinates, start, evaluations=WHOLE)
-    if found.cost > MUCH * again.cost:
-        return prepared, search
+    start = {c.name: found.point[c.name] for c in search.coordinates}
+    again = search.once(Search.begun_at, start, text="nominal: fit without delays")
     late = {delay.name.removeprefix(SIGNAL_DELAY): found.values[delay.name] for delay in delays}
-    signals = list(dict.fromkeys(block.signal for block in prepared.features.blocks))
-    trials = moved_back(prepared.features.trials, late, "the encoder and the fitted nominal model say")
+    late = {name: seconds for name, seconds in late.items() if abs(seconds) >= LEAST}
+    if not (late and needed(again.cost, found.cost)):
+        return prepared, search
+    what = "the encoder" if anchor == "encoder_position" else anchor
+    trials = [
+        trial if is_described(trial) else one
+        for trial, one in zip(
+            prepared.features.trials,
+            moved_back(prepared.features.trials, late, f"{what} and the fitted nominal model say"),
+            strict=True,
+        )
+    ]
     new = prepare(trials, prepared.model, signals=signals)
     notes = tuple(dict.fromkeys((*prepared.notes, *new.notes)))
     return replace(new, notes=notes), search.on(new.problem, new.nuisances)

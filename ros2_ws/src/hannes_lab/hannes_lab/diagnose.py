@@ -34,9 +34,10 @@ from .diagnosis import Diagnosis, Fall, FoundEffect, ParameterEstimate
 from .errors import SignalError
 from .executor import Executor
 from .experiments import separating_experiments
-from .falls import WITHOUT_EFFECT, error_falls, left_out_errors, relative_errors, worth_showing
+from .falls import WITHOUT_EFFECT, deciding_errors, error_falls, left_out_errors, worth_showing
 from .features import data_used
 from .fit import Fit
+from .greedy import OF_NOMINAL
 from .intervals import intervals_of, strain
 from .prepare import Prepared
 from .screen import usable_effects
@@ -274,11 +275,7 @@ def _borne_out(choice: Choice, null: Candidate, falls: tuple[Fall, ...]) -> tupl
         best = search.with_spread(search.fit_of(best.names[:-1]))
     if not alone:
         return choice, falls
-    deciding = (
-        [fall.held_out_conditions for fall in falls]
-        if search.problem.features.repeated
-        else relative_errors(falls)
-    )
+    deciding = deciding_errors(falls)
     first, last = deciding[WITHOUT_EFFECT - 1], deciding[-1]
     fewer = replace(choice, best=best, rivals=(), notes=notes)
     return judged_by_conditions(fewer, null, first, last), falls
@@ -298,11 +295,12 @@ def _idle_at_the_end(
         return f"the error on held-out closures rises with it from {before:.3g} to {after:.3g} times the repeatability"
     if len(found.names) > 1 and (why := led_off(search.fit_of(found.names[:-1]), found, found.names[-1:])):
         return why
-    before, after = falls[-2].held_out_conditions, falls[-1].held_out_conditions
+    before, after = deciding_errors(falls)[-2:]
     if alone and after**2 > (1.0 - EACH_TAKES) * before**2:
+        unit = " times the repeatability" if search.problem.features.repeated else OF_NOMINAL
         return (
-            f"the error on held-out conditions changes with it from {before:.3g} to {after:.3g} times the "
-            f"repeatability only; its mean square must fall by {100 * EACH_TAKES:.0f} %"
+            f"the error on held-out conditions changes with it from {before:.3g} to {after:.3g}{unit} only; its mean "
+            f"square must fall by {100 * EACH_TAKES:.0f} %"
         )
     return ""
 

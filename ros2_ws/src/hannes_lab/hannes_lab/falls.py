@@ -125,6 +125,12 @@ def left_out_errors(falls: Sequence[Fall]) -> list[float]:
     return errors if np.isfinite(errors[1:]).any() else relative_errors(falls)
 
 
+def deciding_errors(falls: Sequence[Fall]) -> list[float]:
+    """Error on held-out conditions of each step, in multiples of the repeatability, or of the fitted nominal's."""
+    errors = [fall.held_out_conditions for fall in falls]
+    return errors if np.isfinite(errors[1:]).any() else relative_errors(falls)
+
+
 def relative_errors(falls: Sequence[Fall]) -> list[float]:
     """Error on held-out conditions in multiples of the fitted nominal model's, root mean square over signals.
 

@@ -32,6 +32,7 @@ ALIKE = 0.02
 
 
 OF_NOMINAL = " times the fitted nominal model's"
+"""What errors count in where nothing was repeated, in words."""
 
 LEFT_OPEN = 0.5
 """An effect of which the data leave a parameter open to the end of its range, or all strengths to nought, joins only if

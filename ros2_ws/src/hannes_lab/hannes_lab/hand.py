@@ -367,18 +367,20 @@ class HandRig(PlantRig):
         out += [Nuisance(f"{SIGNAL_DELAY}{name}", 0.0, REFERENCE_DELAY_SD, False, unit="s") for name in moved]
         return out
 
-    def delays(self) -> list[Nuisance]:
-        """Delays of the signals of recordings that nobody described, for where they are needed (prepare.py).
+    def delays(self, signals: Sequence[str]) -> tuple[str, list[Nuisance]]:
+        """Delays of signals of recordings that nobody described, for where they are needed (delays.py).
 
-        The encoder's is that of the reference; without an encoder the first signal's.
+        With them the signal against which they count, whose delay is the reference's: the encoder, or the first of
+        `signals` without one.
         """
         strange = [trial for trial in self.trials if not is_described(trial)]
+        there = [s for s in signals if any(s in t.signals for t in strange)]
+        anchor = min(there, key=lambda s: s != "encoder_position", default="")
         moved = {name for t in self.trials for name in t.options.get(MOVED, ())}
-        late = dict.fromkeys(name for t in strange for name in sorted(t.signals, key=_encoder_first)[1:])
-        return [
+        return anchor, [
             Nuisance(f"{SIGNAL_DELAY}{name}", 0.0, REFERENCE_DELAY_SD, False, unit="s")
-            for name in late
-            if name not in moved
+            for name in there
+            if name != anchor and name not in moved
         ]
 
     def own_error(self, blocks: Sequence[Block], model: Model) -> Array:
@@ -519,10 +521,6 @@ class HandRig(PlantRig):
         }
 
 
-def _encoder_first(signal: str) -> bool:
-    return signal != "encoder_position"
-
-
 def _span(values: Array) -> float:
     return float(np.ptp(values)) or 1.0
 
@@ -565,11 +563,12 @@ def outer_loop(trials: Sequence[Trial]) -> OuterLoop | None:
         return None
     rows = np.concatenate([table / max(_linear_law(table)[1], 1e-12) for table in tables])
     (per_ampere, lag, delay), left = _linear_law(rows[:, [0, 1, 2, 4]])
-    per_past = 0.0
+    per_past, others = 0.0, [1, 2]
     integrating, with_integral = _linear_law(rows)
     if integrating[3] > 0.0 and with_integral < INTEGRAL_SEEN * left:
         per_ampere, lag, delay, per_past = integrating
-    if per_ampere <= 0.0 or lag <= 0.0 or abs(delay) > 0.2 or _in_common(rows) < IN_COMMON:
+        others = [1, 2, 3]
+    if per_ampere <= 0.0 or lag <= 0.0 or abs(delay) > 0.2 or _in_common(rows, others) < IN_COMMON:
         return None
     return OuterLoop(*(float(x) for x in (1.0 / per_ampere, lag / per_ampere, delay, per_past / per_ampere)))
 
@@ -602,10 +601,10 @@ def _outer_rows(trial: Trial) -> Array | None:
     return table if table.shape[0] >= 30 else None
 
 
-def _in_common(rows: Array) -> float:
-    """Correlation of the current and r - q of `outer_loop`, less what velocity and rate explain of either."""
-    others = rows[:, [1, 2]]
-    own = [x - others @ np.linalg.lstsq(others, x, rcond=None)[0] for x in (rows[:, 0], rows[:, 4])]
+def _in_common(rows: Array, others: Sequence[int]) -> float:
+    """Correlation of the current and r - q of `outer_loop`, less what other columns explain of either."""
+    known = rows[:, others]
+    own = [x - known @ np.linalg.lstsq(known, x, rcond=None)[0] for x in (rows[:, 0], rows[:, 4])]
     both = float(np.linalg.norm(own[0]) * np.linalg.norm(own[1]))
     return float(own[0] @ own[1]) / both if both > 0.0 else 0.0
 

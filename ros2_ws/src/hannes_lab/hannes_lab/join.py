@@ -109,8 +109,8 @@ def _with_others(trials: Sequence[Trial]) -> list[str]:
         return []
     names = ", ".join(dict.fromkeys(trial.name for own in shared.values() for trial in own))
     return [
-        f"{', '.join(shared)}: in several trials ({names}) that hold other conditions too, so that these are not taken "
-        "for repeats; put all closures into one trial, or each condition into trials of its own"
+        f"{', '.join(shared)}: in several trials ({names}) of which some hold other conditions too, so that these are "
+        "not taken for repeats; put all closures into one trial, or each condition into trials of its own"
     ]
 
 

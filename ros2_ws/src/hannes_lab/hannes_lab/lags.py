@@ -131,7 +131,7 @@ def lags_to_voltage(trials: Sequence[Trial]) -> dict[str, float]:
     return {
         name: late
         for name, (late, without) in found.items()
-        if abs(late) >= LATE_TO_VOLTAGE and best <= HALVES * without
+        if LATE_TO_VOLTAGE <= abs(late) < steps[-1] and best <= HALVES * without
     }
 
 

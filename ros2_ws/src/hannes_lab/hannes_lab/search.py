@@ -186,10 +186,11 @@ class Search:
         if self.before is not None:
             return [self.before.fit]
         starts = wide_starts(self.coordinates)
-        found = self.each(Search._begin, [(start,) for start in starts], "nominal: fit")
+        found = self.each(Search.begun_at, [(start,) for start in starts], "nominal: fit")
         return sorted(found, key=lambda f: f.cost)
 
-    def _begin(self, start: Mapping[str, float]) -> Fit:
+    def begun_at(self, start: Mapping[str, float]) -> Fit:
+        """The model as it is, fitted from one point (z by name)."""
         return fit(self.problem, self.model, self.coordinates, start, evaluations=WHOLE)
 
     def _ended(self, found: Fit) -> Fit:

@@ -118,9 +118,11 @@ def summary(
     )
     first = f" First look at the clock: {clock.said}." if clock and clock.part >= CLOCK_LEADS else ""
     if not (names or bent or search.problem.features.repeated):
+        held = len(search.problem.features.conditions) > 1
+        nearer = ", and what was looked for brings nothing that was left out nearer by enough" if held else ""
         return (
             f"{CANNOT_TELL}, for nothing was repeated: {why}, but a guess stands for the "
-            f"scatter, and what was looked for brings nothing that was left out nearer by enough.{first} {fall}{far}"
+            f"scatter{nearer}.{first} {fall}{far}"
         )
     either = choice.other_model or not search.problem.features.repeated
     start = EITHER if either else f"Something is missing that {beyond}"
@@ -404,14 +406,13 @@ def _ends(search: Search, best: Candidate, effects: Sequence[FoundEffect]) -> li
 def moved_notes(found: Fit) -> list[str]:
     """The parameters that a fit took away from their nominal values, farthest first."""
     moved = [c for c, off in found.off if off >= MOVED_BY]
-    return [f"the fit took {_said_off(found, moved)}"] if moved else []
+    return [f"the fit has {_said_off(found, moved)}"] if moved else []
 
 
 def held_notes(found: Fit) -> list[str]:
     """The parameters of the model's file that the end of their range holds."""
     return [
-        f"the fit holds {c.name} at {c.value(float(z)):.4g} {c.unit}, {_held_at(found, c, float(z))}, or is there an "
-        "effect of the same form?"
+        f"the fit holds {c.name} at {c.value(float(z)):.4g} {c.unit}, {_held_at(found, c, float(z))}?"
         for c, z in zip(found.coordinates, found.z, strict=True)
         if c.nuisance and c.name in found.model.names and any(abs(z - end) < HELD for end in c.bounds)
     ]
@@ -423,7 +424,8 @@ def _held_at(found: Fit, c: Coordinate, z: float) -> str:
     if abs(z - c.bounds[0]) < HELD and c.lower > given.lower:
         return "next to nothing, as little as a fit makes of it: is it there at all"
     return (
-        f"the end of its range in the model's file ({given.lower:g} to {given.upper:g}): is that range right"
+        f"the end of its range in the model's file ({given.lower:g} to {given.upper:g}): is that range right, or is "
+        "there an effect of the same form"
     )
 
 
