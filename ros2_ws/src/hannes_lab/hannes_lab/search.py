@@ -468,7 +468,7 @@ class Search:
 
     def with_nuisances(self, nuisances: Sequence[Nuisance]) -> Search:
         """The same search with other nuisance parameters; nothing that was found holds for it."""
-        return self._emptied(nuisances=nuisances)
+        return self.on(self.problem, nuisances)
 
     def on(self, problem: Problem, nuisances: Sequence[Nuisance]) -> Search:
         """The same search on another problem; nothing that was found holds for it."""

@@ -117,15 +117,15 @@ def summary(
         f"is not one of those that were looked for ({_listed(only)})" if only else "is not in the catalogue"
     )
     first = f" First look at the clock: {clock.said}." if clock and clock.part >= CLOCK_LEADS else ""
-    if not (names or bent or search.problem.features.repeated):
-        held = len(search.problem.features.conditions) > 1
+    features = search.problem.features
+    if not (names or bent or features.repeated):
+        held = len(features.conditions) > 1
         nearer = ", and what was looked for brings nothing that was left out nearer by enough" if held else ""
         return (
             f"{CANNOT_TELL}, for nothing was repeated: {why}, but a guess stands for the "
             f"scatter{nearer}.{first} {fall}{far}"
         )
-    either = choice.other_model or not search.problem.features.repeated
-    start = EITHER if either else f"Something is missing that {beyond}"
+    start = EITHER if choice.other_model or not features.repeated else f"Something is missing that {beyond}"
     return f"{start}: {why}.{first}{part} {fall}{'' if choice.other_model or bent else far}"
 
 
@@ -277,7 +277,7 @@ def far_off(best: Candidate) -> list[Coordinate]:
 
 def _far_values(best: Candidate) -> str:
     """The nominal parameters that are far from their values, with what they would be."""
-    return _said_far(best, far_off(best))
+    return _said_far(best.fit, far_off(best))
 
 
 def _far_above(search: Search, best: Candidate) -> str:
@@ -291,7 +291,7 @@ def _far_above(search: Search, best: Candidate) -> str:
     names = {c.name for c in far}
     spared = {effect for name, effect in stands_for.items() if name not in names}
     return _said_far(
-        best,
+        best.fit,
         [
             c
             for c in far
@@ -301,11 +301,7 @@ def _far_above(search: Search, best: Candidate) -> str:
     )
 
 
-def _said_far(best: Candidate, far: Sequence[Coordinate]) -> str:
-    return _said_off(best.fit, far)
-
-
-def _said_off(found: Fit, far: Sequence[Coordinate]) -> str:
+def _said_far(found: Fit, far: Sequence[Coordinate]) -> str:
     values, off = found.values, {c.name: z for c, z in found.off}
     return ", ".join(
         f"{c.name} {values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g} ({off[c.name]:.0f} tolerances)"
@@ -406,7 +402,7 @@ def _ends(search: Search, best: Candidate, effects: Sequence[FoundEffect]) -> li
 def moved_notes(found: Fit) -> list[str]:
     """The parameters that a fit took away from their nominal values, farthest first."""
     moved = [c for c, off in found.off if off >= MOVED_BY]
-    return [f"the fit has {_said_off(found, moved)}"] if moved else []
+    return [f"the fit has {_said_far(found, moved)}"] if moved else []
 
 
 def held_notes(found: Fit) -> list[str]:
