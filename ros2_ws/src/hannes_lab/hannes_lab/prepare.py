@@ -181,6 +181,19 @@ def prepare(
     if rig is not None:
         trials = join_trials(check_trials(trials, (rig if isinstance(rig, type) else type(rig)).__name__))
     trials = [without_outliers(trial) for trial in trials]
+    return prepare_typical(trials, model, rig=rig, signals=signals, surrogate=surrogate, threads=threads)
+
+
+def prepare_typical(
+    trials: Sequence[Trial],
+    model: Model,
+    *,
+    rig: Rig | type[PlantRig] | None = None,
+    signals: Sequence[str] | None = None,
+    surrogate: bool = False,
+    threads: int = 1,
+) -> Prepared:
+    """See prepare; of trials that are joined already, and without closures that are far from the others."""
     hand = rig is None
     rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
     check_parameters(rig, model)
@@ -189,15 +202,8 @@ def prepare(
     if hand:
         trials = with_seen_objects(with_one_clock(trials, model), model)
         rig = HandRig(trials)
-    strange = not isinstance(rig, HandRig)
-    told = check_rig(rig, model) if strange else []
-    known = dict.fromkeys((*SIGNALS, "motor_effort", *(s for t in trials for s in t.signals)))
-    present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
-    unknown = [s for s in signals or () if s not in present]
-    if unknown:
-        there = dict.fromkeys(s for t in trials for s in t.signals)
-        raise HannesError(f"No recording has the signal {', '.join(unknown)}; they have {', '.join(there)}.")
-    features = build_features(trials, present, rig.points, rig.finest)
+    told = [] if isinstance(rig, HandRig) else check_rig(rig, model)
+    features = build_features(trials, _present(trials, signals), rig.points, rig.finest)
     nuisances = tuple(rig.nuisances(model))
     coordinates = [nuisance_coordinate(n) for n in nuisances]
     view = rig_for(rig, model, coordinates, threads) if surrogate else rig
@@ -206,21 +212,46 @@ def prepare(
     # Near is enough for the noise; the search fits the model as it is again, to the end.
     settled, found = settle(problem, found, moves=3)
     problem = build_problem(settled.rig, features, model, nuisances, found.values, problem.counts)
-    notes = notes_of(trials) + ([] if strange else other_plant(trials, model))
-    if strange:
-        notes += told + other_units(rig, model, features)
-        if model.base == Model.base:
-            notes.append(
-                f"the parameters of model '{model.name}' are the Hannes hand's, for it names no others: give its model "
-                "file a line `parameters: FILE.yaml`"
-            )
+    if isinstance(rig, HandRig):
+        of_plant = other_plant(trials, model)
+    else:
+        of_plant = [*told, *other_units(rig, model, features), *_nominal_of_another(model)]
+    notes = (*notes_of(trials), *of_plant, *_what_is_missing(trials, features, rig))
+    return Prepared(rig, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))
+
+
+def _present(trials: Sequence[Trial], signals: Sequence[str] | None) -> list[str]:
+    """Which signals take part: those that are asked for, or all that are there; HannesError for one that is not."""
+    known = dict.fromkeys((*SIGNALS, "motor_effort", *(s for t in trials for s in t.signals)))
+    present = [s for s in (signals or known) if any(s in t.signals for t in trials)]
+    unknown = [s for s in signals or () if s not in present]
+    if unknown:
+        there = dict.fromkeys(s for t in trials for s in t.signals)
+        raise HannesError(f"No recording has the signal {', '.join(unknown)}; they have {', '.join(there)}.")
+    return present
+
+
+def _nominal_of_another(model: Model) -> list[str]:
+    """A note where a rig's model names no parameters, and so has the hand's."""
+    if model.base != Model.base:
+        return []
+    return [
+        f"the parameters of model '{model.name}' are the Hannes hand's, for it names no others: give its model file a "
+        "line `parameters: FILE.yaml`"
+    ]
+
+
+def _what_is_missing(trials: Sequence[Trial], features: Features, rig: Rig) -> list[str]:
+    """What these recordings cannot say: conditions, signals and closures that are not there, closures that drift."""
+    present = dict.fromkeys(block.signal for block in features.blocks)
+    notes = []
     if len(features.conditions) < 2:
         notes.append(
             "there is one condition only: what fits it may fail elsewhere; record another speed, and another load"
         )
     if not any(signal in present for signal in rig.drive_signals):
         drive = rig.drive_signals[0].removeprefix("motor_").replace("_", " ")
-        only = f" (only {', '.join(present)})" if strange else ""
+        only = "" if isinstance(rig, HandRig) else f" (only {', '.join(present)})"
         notes.append(
             f"no {drive} is recorded{only}: friction, torque constant and inertia are hard to tell apart"
         )
@@ -246,7 +277,7 @@ def prepare(
             f"fewer than five closures of {', '.join(few)}: what the fit takes for scatter is a guess from the priors "
             "in part, and no error is called beyond chance"
         )
-    return Prepared(rig, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))
+    return notes
 
 
 def notes_of(trials: Sequence[Trial]) -> list[str]:

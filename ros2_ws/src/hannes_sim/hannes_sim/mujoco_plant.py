@@ -264,6 +264,11 @@ _STEP_ADDRESS = ctypes.cast(_mujoco_library.mj_step, ctypes.c_void_p).value
 if mujoco.get_mju_user_warning() is None:
     mujoco.set_mju_user_warning(lambda message: None)
 
+# MuJoCo's profiler (mjData.timer) reads the clock some thirty times a step, 7 % of a step of the hand.  The Python
+# package switches it on, and set_mjcb_time(None) leaves its clock where it is; a clock that the user has set stays.
+if mujoco.get_mjcb_time() is None:
+    ctypes.c_void_p.in_dll(_mujoco_library, "mjcb_time").value = None
+
 _NAMES = {
     "supply.voltage": P_SUPPLY,
     "motor.resistance": P_RESISTANCE,
@@ -294,7 +299,8 @@ object.stiffness [N.m/rad] and object.damping [N.m.s/rad] are those of the whole
 class MujocoPlant:
     """The multi-body plant of a model; see the module's docstring and hannes_description.mjcf for its equations.
 
-    `spec` and `model` and `data` are MuJoCo's own objects, for pictures and measurements; the plant writes into them.
+    `spec`, `model` and `data` are MuJoCo's own objects, for measurements, without what is only seen (render.py shows
+    it); the plant writes into them.
     """
 
     def __init__(self, model: Model, grasp: GraspObject | None = None, *, dt: float = DEFAULT_DT) -> None:
@@ -352,6 +358,8 @@ class MujocoPlant:
         values = self._values
         self.spec = build_spec(values, self.variant, self.grasp)
         self.spec.option.timestep = self.dt
+        # What is only seen costs a step's kinematics and moves nothing; pictures are made by render.py.
+        self.spec.compiler.discardvisual = True
         try:
             self.model = self.spec.compile()
         except ValueError as error:
