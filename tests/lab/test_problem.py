@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hannes_description.model import Model
-from hannes_lab.chance import noise_draws
+from hannes_lab.chance import Chance, chance, noise_draws
 from hannes_lab.errors import split_closures
 from hannes_lab.features import Block, Features
+from hannes_lab.fit import fit
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import Problem, build_problem, nuisance_coordinate
@@ -94,12 +95,41 @@ def test_two_recordings_of_one_condition_have_closures_of_their_own(prepared: Pr
     assert np.array_equal(problem.residual(prepared.model, {}), problem.residual(prepared.model, {}))
     for block in (0, len(one.blocks)):
         assert mean_square(prepared, both, block) == pytest.approx(1.0, rel=0.35)
-    draws, resampled = noise_draws(problem, 200, np.random.default_rng(0))
+    draws, _, resampled = noise_draws(problem, 200, np.random.default_rng(0))
     assert resampled
     mean = [
         draws[both.slices[k].start : both.slices[k].start + first[0].phase.size] for k in (0, len(one.blocks))
     ]
     assert abs(np.corrcoef(mean[0].ravel(), mean[1].ravel())[0, 1]) < 0.05
+
+
+def reached(prepared: Prepared, order: np.ndarray, size: float = 3.0) -> Chance:
+    """What chance reaches of an effect that makes the current of one condition rise ever more slowly from closure to
+    closure, where the closures rise so, taken in an order."""
+    blocks = list(as_measured(prepared, prepared.features).features.blocks)
+    k = next(k for k, b in enumerate(blocks) if b.signal == "motor_current")
+    block, slices = blocks[k], prepared.features.slices
+    rise = np.outer(1.0 - np.exp(-np.arange(block.n) / 5.0), np.ones(block.phase.size))
+    rise *= size * NOISE * np.ptp(block.measured)
+    blocks[k] = replace(block, measured=block.measured + (rise - rise.mean(axis=0))[order])
+    features = replace(prepared.features, blocks=tuple(blocks), slices=())
+    problem = build_problem(prepared.rig, features, prepared.model, (), {})
+    found = fit(problem, prepared.model, [nuisance_coordinate(prepared.nuisances[0])], {}, evaluations=1)
+    signature = np.zeros((features.size, 1))
+    signature[slices[k], 0] = block.combine(rise)
+    return chance(problem, found, {"warming up": [problem.whiten(signature)]})
+
+
+def test_a_drift_is_no_chance_of_an_effect(prepared: Prepared) -> None:
+    n = prepared.features.blocks[0].n
+    still = reached(prepared, np.arange(n), 1e-9)
+    drifting = reached(prepared, np.arange(n))
+    mixed = reached(prepared, np.random.default_rng(1).permutation(n))
+    assert mixed.gain > 2.0 * still.gain, "the same in any order is scatter, and an effect may gain by it"
+    assert drifting.gain < 1.5 * still.gain
+    assert drifting.misfit > 1.1 * still.misfit, (
+        "what is left of a drift for which there is no effect is scatter"
+    )
 
 
 def test_a_tolerance_may_be_wider_downwards() -> None:

@@ -4,6 +4,9 @@ Wild bootstrap over closures: the deviations of the closures from their mean, wi
 of the noise of the mean (Liu 1988, Mammen 1993); for a first closure, which starts from another state, stands another
 one.  It keeps all correlation along the closure and between signals,
 and it assumes no distribution.  With too few closures to resample, draws come from the estimated covariance instead.
+Where closures drift from the first to the last, that is taken out of what an effect may gain by chance: one that
+explains how a drift goes does not do so by chance.  It stays in what a complete model may leave: where there is no
+effect for it, it is scatter, and is said (prepare.drifts).
 """
 
 from __future__ import annotations
@@ -14,6 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .drift import drift_of, steadied
+from .features import Block
 from .fit import Fit
 from .problem import Problem
 
@@ -43,13 +48,16 @@ class Chance:
     resampled: bool
 
 
-def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple[Array, bool]:
-    """Whitened noise of the features (size, draws)."""
+def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple[Array, Array, bool]:
+    """Whitened noise of the features (size, draws), the same without what drifts, and whether it was resampled."""
     blocks = problem.features.blocks
     resampled = all(block.n >= MIN_CLOSURES for block in blocks)
     if not resampled:
-        return rng.standard_normal((problem.features.size, draws)), False
+        noise = rng.standard_normal((problem.features.size, draws))
+        return noise, noise, False
+    drifting = {(block.trial, block.condition) for block in blocks if drift_of(block)}
     raw = np.empty((problem.features.size, draws))
+    steady = np.empty_like(raw)
     drawn: dict[tuple[int, str, int], tuple[Array, Array]] = {}
     for block, rows, deviation in zip(blocks, problem.features.slices, problem.deviations, strict=True):
         n, m = block.n, deviation.shape[0]
@@ -61,11 +69,20 @@ def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple
             drawn[closures] = which, rng.choice([-1.0, 1.0], size=(draws, n))
         which, signs = drawn[closures]
         scale = np.sqrt(m / (m - 1.0))
-        for k in range(draws):
-            raw[rows, k] = block.combine(signs[k][:, None] * deviation[which[k]]) * scale
+
+        def draw(of: Array, block: Block = block, which: Array = which, signs: Array = signs) -> Array:
+            drawn = [block.combine(signs[k][:, None] * of[which[k]]) for k in range(draws)]
+            return np.stack(drawn, axis=1)
+
+        raw[rows] = steady[rows] = draw(deviation) * scale
+        if (block.trial, block.condition) in drifting:
+            steady[rows] = draw(steadied(deviation)) * scale
     for own, lower in problem.discrepancy:
-        raw[own] += lower @ rng.standard_normal((own.size, draws))
-    return problem.whiten(raw), True
+        form = lower @ rng.standard_normal((own.size, draws))
+        raw[own] += form
+        steady[own] += form
+    noise = problem.whiten(raw)
+    return noise, problem.whiten(steady) if drifting else noise, True
 
 
 def chance(
@@ -82,13 +99,19 @@ def chance(
     signatures   per effect, derivatives (size, k) at vanishing strength for each start of its shape parameters
     """
     rng = np.random.default_rng(seed)
-    noise, resampled = noise_draws(problem, draws, rng)
+    noise, steady, resampled = noise_draws(problem, draws, rng)
     prior = np.array([1.0 if c.prior else 1e-6 for c in null.coordinates])
     jacobian = np.vstack([null.jacobian, np.diag(np.sqrt(prior))])
     basis, _ = np.linalg.qr(jacobian)
-    padded = np.vstack([noise, np.zeros((prior.size, draws))])
-    left = padded - basis @ (basis.T @ padded)
+
+    def left_of(drawn: Array) -> Array:
+        padded = np.vstack([drawn, np.zeros((prior.size, draws))])
+        rest: Array = padded - basis @ (basis.T @ padded)
+        return rest
+
+    left = left_of(noise)
     misfit = (left**2).sum(axis=0)
+    left = left if steady is noise else left_of(steady)
     gains = np.zeros(draws)
     for shapes in signatures.values():
         for signature in shapes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,10 +13,10 @@ from hannes_bags.storage import existing, find_bags
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_sim.effect import call_own
-from scipy.special import ndtr
 
 from .adapter import check_rig, check_trials, other_units
 from .blocks import in_blocks, told_apart
+from .drift import drift_of
 from .features import Features, build_features
 from .fit import fit
 from .grasp import with_seen_objects
@@ -46,9 +45,6 @@ from .units import in_si
 
 OUTLIER = 6.0
 """A closure whose distance from the median closure exceeds this multiple of the median distance is left out."""
-
-DRIFT = 1e-4
-"""Chance of a trend below which closures are said to drift."""
 
 FEW = 5
 """Closures of a condition below which its scatter is no more than guessed, and no test is made (compare.py)."""
@@ -296,26 +292,13 @@ def notes_of(trials: Sequence[Trial]) -> list[str]:
 
 
 def drifts(features: Features, machine: str = "hand") -> list[str]:
-    """A sentence for each condition whose closures change steadily from the first to the last.
-
-    Mann-Kendall test of a signal's closures along their first principal component: scatter is by chance from closure to
-    closure, a drift is not.  Fewer than ten cannot show it.
-    """
+    """A sentence for each condition whose closures change steadily from the first to the last."""
     out = []
     for condition in features.conditions:
-        drifting = {}
-        for block in features.blocks:
-            if block.condition != condition or block.n < 3:
-                continue
-            away = block.measured - block.measured.mean(axis=0)
-            scores, sizes, _ = np.linalg.svd(away, full_matrices=False)
-            rising = int(np.sign(scores[None, :, 0] - scores[:, None, 0])[np.triu_indices(block.n, 1)].sum())
-            sd = math.sqrt(block.n * (block.n - 1) * (2 * block.n + 5) / 18.0)
-            if 2.0 * ndtr((1 - abs(rising)) / sd) < DRIFT:
-                drifting[block.signal] = 100.0 * float((sizes[0] / np.linalg.norm(sizes)) ** 2)
-        if drifting:
+        own = {block.signal: drift_of(block) for block in features.blocks if block.condition == condition}
+        if any(own.values()):
             shares = ", ".join(
-                f"{share:.0f} % of the scatter of {signal}" for signal, share in drifting.items()
+                f"{100.0 * share:.0f} % of the scatter of {signal}" for signal, share in own.items() if share
             )
             out.append(
                 f"{condition}: the closures drift from the first to the last ({shares}), which the repeatability holds "
