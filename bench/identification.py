@@ -34,10 +34,11 @@ from hannes_description.model import EffectEntry, Model
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.errors import overall, repeatability, signal_errors, split_closures
 from hannes_lab.fit import fit
+from hannes_lab.hand import HandRig
 from hannes_lab.hide import Truth, make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.search import Search
-from hannes_lab.trials import make_trial
+from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import catalogue, effect_source, load_effect
 from joblib import Parallel, delayed
 
@@ -133,7 +134,8 @@ def run_case(case: Case) -> dict[str, Any]:
         Model.load(case.made_by), case.entries(), seed=case.seed, closures=case.closures, sensors=case.sensors
     )
     start = time.monotonic()
-    prepared = prepare([make_trial(r) for r in recordings], model, signals=case.signals or None)
+    trials = [make_trial(r) for r in recordings]
+    prepared = prepare(trials, model, signals=case.signals or None)
     found = diagnose(prepared, effect_sources(model=model))
     hidden = sorted(e.name for e in truth.effects)
     # what comes nearest to something unknown is no answer
@@ -162,20 +164,23 @@ def run_case(case: Case) -> dict[str, Any]:
         "costs": dict(found.costs),
         "falls": [[f.added, f.held_out, dict(f.by_condition)] for f in found.falls],
         "final": found.falls[-1].held_out,
-        "hidden_hand": error_of_the_hidden(prepared, Model.load(case.made_by), truth),
+        "hidden_hand": error_of_the_hidden(trials, prepared, Model.load(case.made_by), truth),
         "nominal": found.falls[0].held_out,
         "seconds": time.monotonic() - start,
         "simulations": found.simulations,
     }
 
 
-def error_of_the_hidden(prepared: Prepared, made_by: Model, truth: Truth) -> float:
-    """Error of the hidden hand itself on the held-out closures: no answer that is right comes far below it."""
+def error_of_the_hidden(trials: list[Trial], prepared: Prepared, made_by: Model, truth: Truth) -> float:
+    """Error of the hidden hand itself on the held-out closures: no answer that is right comes far below it.
+
+    trials  as recorded: what was seen of an object is no nominal value
+    """
     model = made_by
     for effect in truth.effects:
         model = model.with_effect(effect)
     values = {}
-    for nuisance in prepared.rig.nuisances(made_by):
+    for nuisance in HandRig(trials).nuisances(made_by):
         operation, number, *_ = truth.parameters.get(nuisance.name.partition("@")[0], "x 1").split()
         values[nuisance.name] = (
             nuisance.mean * float(number) if operation == "x" else nuisance.mean + float(number)
