@@ -409,9 +409,12 @@ class HandRig(PlantRig):
         """How errors of standard deviation 1 make up that of a block: (p, p) by what strays."""
         trial, p, whole = self.trials[block.trial], model.parameters, np.eye(block.phase.size)
         if block.signal != "motor_voltage" or not {"motor_current", "encoder_position"} <= set(trial.signals):
-            return {
-                block.signal: OWN_ERROR.get(block.signal, OWN_ERROR_DRIVE) * _span(block.measured) * whole
-            }
+            wide = OWN_ERROR.get(block.signal, OWN_ERROR_DRIVE) * _span(block.measured)
+            if block.signal == "grip_force" and object_of(trial) is None:
+                # All that it shows is its own: a zero that is known no better than its noise, or noise without what is
+                # below nought.
+                wide = math.hypot(wide, float(block.measured.std()))
+            return {block.signal: wide * whole}
         rate = np.asarray(np.gradient(whole, block.phase, axis=0))
         volts = block.measured.mean(axis=0)
         amperes, angle = (
