@@ -167,6 +167,19 @@ def test_the_folder_stays_below_its_limit_and_the_oldest_go_first(tmp_path: Path
     assert "lost.part" not in left
 
 
+def test_a_run_that_keeps_more_than_the_limit_finds_it_all_again(tmp_path: Path) -> None:
+    store = Store(tmp_path, limit=100_000)
+    keys = [f"{k:064d}" for k in range(130)]
+    for key in keys:
+        store.write(key, [np.full(1000, 1.0)])
+    again = Store(tmp_path, limit=100_000)
+    assert all(again.read(key) is not None for key in keys)
+    for key in keys:
+        os.utime(tmp_path / f"{key}.npz", (0, 0))
+    Store(tmp_path, limit=100_000)
+    assert sum(p.stat().st_size for p in tmp_path.iterdir()) <= 100_000
+
+
 def test_a_folder_that_cannot_be_used_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "file").write_text("not a folder")
     store = Store(tmp_path / "file")

@@ -3,7 +3,7 @@
 One result is one .npz file of plain numbers: a JSON text and the arrays that it refers to.  Nothing in it can run, and
 its checksums show a file that was cut off or altered, which then counts as missing.  A file appears under its name only
 when it is whole, so any number of processes may read and write the same folder.  The oldest results make way when the
-folder is full.
+folder is full, but for those of a present run.
 """
 
 from __future__ import annotations
@@ -33,8 +33,12 @@ from hannes_description.model import Model
 
 from .fit import Fit
 
-LIMIT = 512 * 2**20
-"""Bytes that the folder may take."""
+LIMIT = 2**30
+"""Bytes that the folder may take, but for what was used in the last RUN seconds."""
+
+RUN = 3600.0
+"""A run that keeps more than the limit would lose its begin before its end, and repeated lose each result just before
+that is wanted: it would find nothing."""
 
 STALE = 3600.0
 """Seconds after which an unfinished file belongs to a process that is gone."""
@@ -154,7 +158,8 @@ def default_folder(name: str = "lab") -> Path:
 class Store:
     """Results by key in a folder.
 
-    limit   bytes that the folder may take; the results that were not used for the longest time go first
+    limit   bytes that the folder may take; the results that were not used for the longest time go first, those of the
+            last RUN seconds never
     hits    results that were found
     """
 
@@ -218,19 +223,19 @@ class Store:
             self.prune()
 
     def prune(self) -> None:
-        """Remove what processes left unfinished, and the oldest results above the limit."""
-        found = []
+        """Remove what processes left unfinished, and the oldest results above the limit, but none of a present run."""
+        found, now = [], time.time()
         with suppress(OSError):
             for path in self.folder.iterdir():
                 with suppress(OSError):
                     state = path.stat()
-                    if path.suffix == ".part" and time.time() - state.st_mtime > STALE:
+                    if path.suffix == ".part" and now - state.st_mtime > STALE:
                         path.unlink(missing_ok=True)
                     elif path.suffix == ".npz":
                         found.append((state.st_mtime, state.st_size, path))
         total = sum(size for _, size, _ in found)
-        for _, size, path in sorted(found):
-            if total <= self.limit:
+        for used, size, path in sorted(found):
+            if total <= self.limit or now - used < RUN:
                 break
             with suppress(OSError):
                 path.unlink(missing_ok=True)
