@@ -95,7 +95,7 @@ def test_two_recordings_of_one_condition_have_closures_of_their_own(prepared: Pr
     assert np.array_equal(problem.residual(prepared.model, {}), problem.residual(prepared.model, {}))
     for block in (0, len(one.blocks)):
         assert mean_square(prepared, both, block) == pytest.approx(1.0, rel=0.35)
-    draws, _, resampled = noise_draws(problem, 200, np.random.default_rng(0))
+    draws, resampled = noise_draws(problem, 200, np.random.default_rng(0))
     assert resampled
     mean = [
         draws[both.slices[k].start : both.slices[k].start + first[0].phase.size] for k in (0, len(one.blocks))

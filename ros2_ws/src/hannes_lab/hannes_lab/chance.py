@@ -12,13 +12,12 @@ effect for it, it is scatter, and is said (prepare.drifts).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .drift import drift_of, steadied
-from .features import Block
 from .fit import Fit
 from .problem import Problem
 
@@ -48,16 +47,13 @@ class Chance:
     resampled: bool
 
 
-def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple[Array, Array, bool]:
-    """Whitened noise of the features (size, draws), the same without what drifts, and whether it was resampled."""
+def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple[Array, bool]:
+    """Whitened noise of the features (size, draws)."""
     blocks = problem.features.blocks
     resampled = all(block.n >= MIN_CLOSURES for block in blocks)
     if not resampled:
-        noise = rng.standard_normal((problem.features.size, draws))
-        return noise, noise, False
-    drifting = {(block.trial, block.condition) for block in blocks if drift_of(block)}
+        return rng.standard_normal((problem.features.size, draws)), False
     raw = np.empty((problem.features.size, draws))
-    steady = np.empty_like(raw)
     drawn: dict[tuple[int, str, int], tuple[Array, Array]] = {}
     for block, rows, deviation in zip(blocks, problem.features.slices, problem.deviations, strict=True):
         n, m = block.n, deviation.shape[0]
@@ -69,20 +65,23 @@ def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple
             drawn[closures] = which, rng.choice([-1.0, 1.0], size=(draws, n))
         which, signs = drawn[closures]
         scale = np.sqrt(m / (m - 1.0))
-
-        def draw(of: Array, block: Block = block, which: Array = which, signs: Array = signs) -> Array:
-            drawn = [block.combine(signs[k][:, None] * of[which[k]]) for k in range(draws)]
-            return np.stack(drawn, axis=1)
-
-        raw[rows] = steady[rows] = draw(deviation) * scale
-        if (block.trial, block.condition) in drifting:
-            steady[rows] = draw(steadied(deviation)) * scale
+        for k in range(draws):
+            raw[rows, k] = block.combine(signs[k][:, None] * deviation[which[k]]) * scale
     for own, lower in problem.discrepancy:
-        form = lower @ rng.standard_normal((own.size, draws))
-        raw[own] += form
-        steady[own] += form
-    noise = problem.whiten(raw)
-    return noise, problem.whiten(steady) if drifting else noise, True
+        raw[own] += lower @ rng.standard_normal((own.size, draws))
+    return problem.whiten(raw), True
+
+
+def without_drift(problem: Problem) -> Problem:
+    """The problem with what drifts taken out of the scatter; the same where nothing drifts."""
+    blocks = problem.features.blocks
+    drifting = {(block.trial, block.condition) for block in blocks if drift_of(block)}
+    if not drifting:
+        return problem
+    pairs = zip(blocks, problem.deviations, strict=True)
+    return replace(
+        problem, deviations=tuple(steadied(d) if (b.trial, b.condition) in drifting else d for b, d in pairs)
+    )
 
 
 def chance(
@@ -98,8 +97,7 @@ def chance(
 
     signatures   per effect, derivatives (size, k) at vanishing strength for each start of its shape parameters
     """
-    rng = np.random.default_rng(seed)
-    noise, steady, resampled = noise_draws(problem, draws, rng)
+    noise, resampled = noise_draws(problem, draws, np.random.default_rng(seed))
     prior = np.array([1.0 if c.prior else 1e-6 for c in null.coordinates])
     jacobian = np.vstack([null.jacobian, np.diag(np.sqrt(prior))])
     basis, _ = np.linalg.qr(jacobian)
@@ -111,7 +109,9 @@ def chance(
 
     left = left_of(noise)
     misfit = (left**2).sum(axis=0)
-    left = left if steady is noise else left_of(steady)
+    if resampled and (steady := without_drift(problem)) is not problem:
+        # The same signs: nothing else differs.
+        left = left_of(noise_draws(steady, draws, np.random.default_rng(seed))[0])
     gains = np.zeros(draws)
     for shapes in signatures.values():
         for signature in shapes:

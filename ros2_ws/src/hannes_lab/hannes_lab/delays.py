@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from .hand import SIGNAL_DELAY, HandRig, is_described
 from .lags import moved_back
-from .prepare import Prepared, prepare_typical
+from .prepare import Prepared, prepare
 from .search import Search
 
 MUCH, EACH = 0.8, 9.0
@@ -55,6 +55,6 @@ def in_time(prepared: Prepared, search: Search) -> tuple[Prepared, Search]:
             strict=True,
         )
     ]
-    new = prepare_typical(trials, prepared.model, signals=signals)
+    new = prepare(trials, prepared.model, signals=signals, typical=True)
     notes = tuple(dict.fromkeys((*prepared.notes, *new.notes)))
     return replace(new, notes=notes), search.on(new.problem, new.nuisances)

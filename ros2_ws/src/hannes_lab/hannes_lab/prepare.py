@@ -166,6 +166,7 @@ def prepare(
     signals: Sequence[str] | None = None,
     surrogate: bool = False,
     threads: int = 1,
+    typical: bool = False,
 ) -> Prepared:
     """Estimate noise and scatter at the fitted nominal model.
 
@@ -173,23 +174,12 @@ def prepare(
     signals  which signals take part; all that are there if None
     surrogate  search a slow plant through a fast one (surrogate.py); `rig` of the result is the exact one
     threads  among which the slow plant's simulations are divided while this process works alone
+    typical  closures far from the others are left out already
     """
     if rig is not None:
         trials = join_trials(check_trials(trials, (rig if isinstance(rig, type) else type(rig)).__name__))
-    trials = [without_outliers(trial) for trial in trials]
-    return prepare_typical(trials, model, rig=rig, signals=signals, surrogate=surrogate, threads=threads)
-
-
-def prepare_typical(
-    trials: Sequence[Trial],
-    model: Model,
-    *,
-    rig: Rig | type[PlantRig] | None = None,
-    signals: Sequence[str] | None = None,
-    surrogate: bool = False,
-    threads: int = 1,
-) -> Prepared:
-    """See prepare; of trials that are joined already, and without closures that are far from the others."""
+    if not typical:
+        trials = [without_outliers(trial) for trial in trials]
     hand = rig is None
     rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
     check_parameters(rig, model)
