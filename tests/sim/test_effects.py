@@ -22,6 +22,7 @@ from hannes_sim.ports import (
     LOAD_FRICTION,
     QL,
     RESISTANCE,
+    SENSE_POSITION,
     SLACK,
     TORQUE,
     Q,
@@ -147,6 +148,27 @@ def test_equations_by_hand() -> None:
         )
     # T = Rth R i2 / (1 - alpha Rth R i2): the resistance grows with the temperature
     assert states[0] == pytest.approx(15.0 / (1 - 0.0039 * 15.0), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("at", "speed", "current", "taken"),
+    [
+        (0.0, 1.0, 1.0, True),  # in the gap
+        (0.06, 1.0, -1.0, False),  # pushes the upper flank
+        (0.06, 0.0, 1.0, False),  # rests there, and will push it
+        (0.06, 0.0, -1.0, True),  # rests there, and will leave it
+        (0.05, -1.0, 1.0, True),
+        (-0.06, -1.0, 1.0, False),
+        (-0.06, 0.0, 1.0, True),
+    ],
+)
+def test_the_motor_feels_friction_beyond_a_gap_only_at_the_flank_that_it_pushes(
+    at: float, speed: float, current: float, taken: bool
+) -> None:
+    gap = {"width": 0.1, "beyond": 0.012}
+    there = evaluate(load_effect("gear_backlash"), gap, {Q: at, V: speed, CURRENT: current}, np.zeros(1))
+    assert there[FRICTION] == (-0.012 if taken else 0.0)
+    assert there[SENSE_POSITION] == pytest.approx(-at if abs(at) < 0.05 else -math.copysign(0.05, at))
 
 
 def test_what_is_usual_is_said_of_shapes_only() -> None:

@@ -116,6 +116,23 @@ def test_effects_act_on_every_plant(model: Model) -> None:
         assert run.motor_current[closing].mean() > 1.1 * base.motor_current[closing].mean(), name
 
 
+def test_friction_beyond_a_gap_is_the_same_in_both_plants() -> None:
+    """Against the same gap without it: where and how much the current falls."""
+    change = []
+    for name in ("nominal", "nominal_mujoco"):
+        model = Model.load(name)
+        law, reference = DoublePID.of_model(model.parameters), half_sine(1, amplitude=10.0, period=2.0)
+        gap = load_effect("gear_backlash")
+        bare, held = (
+            rollout(make_plant(model.with_effect(gap.entry(values))), law, reference)
+            for values in ({"width": 0.15}, {"width": 0.15, "beyond": 0.012})
+        )
+        change.append(held.motor_current - bare.motor_current)
+    reduced, full = change
+    assert np.corrcoef(reduced, full)[0, 1] > 0.7
+    assert 0.7 < np.linalg.norm(full) / np.linalg.norm(reduced) < 1.4
+
+
 def test_open_loop_playback_reproduces_the_closed_loop(plant: Plant, model: Model) -> None:
     law = DoublePID.of_model(model.parameters)
     closed = rollout(plant, law, half_sine(1, amplitude=8.0, period=0.8))
