@@ -38,7 +38,7 @@ from .falls import WITHOUT_EFFECT, deciding_errors, error_falls, left_out_errors
 from .features import data_used
 from .fit import Fit
 from .greedy import OF_NOMINAL
-from .intervals import intervals_of, strain
+from .intervals import intervals_of, strain, sway, wider
 from .prepare import Prepared
 from .screen import usable_effects
 from .search import FAR, PENALTY, Candidate, Progress, Search, silent
@@ -413,11 +413,12 @@ def _foretells(falls: Sequence[Fall]) -> bool:
 def spans_of(
     search: Search, best: Candidate, limits: Chance, falls: Sequence[Fall]
 ) -> dict[str, tuple[float, float]]:
-    """95 % intervals of a fitted set; on a machine of others by how far it moves without a condition, too."""
+    """95 % intervals of a fitted set, by its closures' scatter; on a machine of others by its conditions, too."""
     problem = search.problem
-    foreign = problem.rig.foreign or problem.discrepancy
-    wider = strain(problem.features, best.fit, limits, falls[-1].left_out) if foreign else {}
-    return intervals_of(best.fit, limits, wider)
+    reasons = [sway(problem, best.fit)]
+    if problem.rig.foreign or problem.discrepancy:
+        reasons.append(strain(problem.features, best.fit, limits, falls[-1].left_out))
+    return intervals_of(best.fit, limits, wider(*reasons))
 
 
 def fitted_model(

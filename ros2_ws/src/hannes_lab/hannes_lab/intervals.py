@@ -1,8 +1,10 @@
 """95 % intervals of fitted parameters, and how much wider they are than the curvature of the cost says.
 
-The curvature takes what is left for noise that is independent from sample to sample.  On a machine of others it is not:
-a friction that wanders, or a law of another form, pulls a fit in each condition elsewhere.  How far the parameters move
-when a condition is left out, against how far they should by the curvature, says by how much.
+The curvature takes what is left for noise that is independent from sample to sample, but for the scatter of which
+tolerances speak.  On a machine of others it is not.  A friction that is another in each lap moves whole curves: how far
+the closures' own scatter moves the parameters is read off the closures (`sway`).  A law of another form pulls a fit in
+each condition elsewhere: how far the parameters move when a condition is left out, against how far they should by the
+curvature, says by how much (`strain`).
 """
 
 from __future__ import annotations
@@ -11,10 +13,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student_t
 
 from .chance import Chance
 from .features import Features
-from .fit import Fit
+from .fit import Fit, prior_weights
+from .problem import Problem
+
+NORMAL = 1.96
+"""Standard deviations from the middle to the end of a 95 % interval, where the standard deviation is known."""
 
 LEAST_MOVE = 0.1
 """Part of a parameter's variance by which it may move at least when a condition is left out that hardly tells it."""
@@ -42,16 +50,67 @@ def strain(features: Features, found: Fit, limits: Chance, left_out: LeftOut) ->
     return {name: max(1.0, float(np.sqrt(np.mean(own)))) for name, own in squares.items()}
 
 
+def sway(problem: Problem, found: Fit) -> dict[str, float]:
+    """How many times farther the closures' own scatter moves each parameter than by the curvature; at least 1.
+
+    Each closure's deviation from the mean moves the estimate by what it makes of the mean; the squares of those moves
+    add up to the estimate's covariance, whatever the noise's correlation along a closure and between signals (the
+    sandwich estimator of Huber 1967, with closures as its clusters: Liang, Zeger 1986, Longitudinal data analysis using
+    generalized linear models).  Closures of one number in one recording are taken for one lap, which has the same
+    scatter in all its conditions.  That few laps know a variance badly is in it: quantiles of Student's t, with degrees
+    of freedom after Satterthwaite 1946.  What was not repeated has the noise that the problem gives it.
+    """
+    inverse, size = found.covariance(), problem.features.size
+    laps: dict[int, dict[int, NDArray[np.float64]]] = {}
+    counts: dict[int, int] = {}
+    once = np.zeros(size, dtype=bool)
+    for block, rows, deviations in zip(
+        problem.features.blocks, problem.features.slices, problem.deviations, strict=True
+    ):
+        n, m = block.n, deviations.shape[0]
+        if m < 2:
+            once[rows] = True
+            continue
+        counts[block.trial] = max(counts.get(block.trial, 0), m)
+        for k in range(m):
+            one = np.zeros((n, deviations.shape[1]))
+            one[n - m + k] = deviations[k] * np.sqrt(n / (m - 1.0))
+            lap = laps.setdefault(block.trial, {}).setdefault(n - m + k, np.zeros(size))
+            lap[rows] += block.combine(one)
+    if not laps:
+        return {}
+    known = np.diag(prior_weights(found.coordinates)) + found.jacobian[once].T @ found.jacobian[once]
+    for own, lower in problem.discrepancy:
+        columns = np.zeros((size, own.size))
+        columns[own] = lower
+        moved = found.jacobian.T @ problem.whiten(columns)
+        known += moved @ moved.T
+    variance, by_freedom = np.diag(inverse @ known @ inverse).copy(), np.zeros(len(found.coordinates))
+    for trial, own_laps in laps.items():
+        moved = inverse @ found.jacobian.T @ problem.whiten(np.stack(list(own_laps.values()), axis=1))
+        part = (moved**2).sum(axis=1)
+        variance += part
+        by_freedom += part**2 / (counts[trial] - 1.0)
+    freedom = variance**2 / np.maximum(by_freedom, 1e-12 * variance**2)
+    ratios = np.sqrt(variance / np.diag(inverse)) * student_t.ppf(0.975, freedom) / NORMAL
+    return {c.name: max(1.0, float(r)) for c, r in zip(found.coordinates, ratios, strict=True)}
+
+
+def wider(*reasons: Mapping[str, float]) -> dict[str, float]:
+    """By how much intervals are wider, by name: of several reasons the largest."""
+    return {name: max(r.get(name, 1.0) for r in reasons) for name in {n for r in reasons for n in r}}
+
+
 def intervals_of(
     found: Fit, limits: Chance, wider: Mapping[str, float] | None = None
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals by name, from the curvature of the cost, inside the parameter's bounds.
 
-    Wider by as much as the misfit is larger than chance makes it, and by `wider` times (strain).
+    Wider by as much as the misfit is larger than chance makes it, and by `wider` times (strain, sway).
     """
     out = {}
     for c, z, s in zip(found.coordinates, found.z, found.sd(_inflation(found, limits)), strict=True):
-        half = 1.96 * float(s) * (wider or {}).get(c.name, 1.0)
+        half = NORMAL * float(s) * (wider or {}).get(c.name, 1.0)
         ends = sorted((c.value(float(z) - half), c.value(float(z) + half)))
         out[c.name] = (ends[0], ends[1])
     return out
