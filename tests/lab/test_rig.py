@@ -26,7 +26,7 @@ from hannes_lab.rig import Nuisance, load_rig, scaled_effect, unit_factor
 from hannes_lab.screen import usable_effects
 from hannes_lab.search import Candidate, Search
 from hannes_lab.spectrum import position_periods
-from hannes_lab.trials import find_moves
+from hannes_lab.trials import Closure, Trial, find_moves
 from hannes_sim.effect import EffectParameter, catalogue, load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.rollout import rollout
@@ -89,6 +89,44 @@ def test_moves_after_stands_of_other_lengths_begin_alike() -> None:
     leaves = np.cumsum([0.3, 2.2, 2.0, 2.5])
     assert [a for a, _ in spans] == pytest.approx(list(leaves - 0.3), abs=0.005)
     assert [b - a for a, b in spans] == pytest.approx([2.2, 2.0, 2.5, 2.2], abs=0.005)
+
+
+def test_a_stand_with_rounding_errors_is_one_stand() -> None:
+    path = np.concatenate([np.full(500, 0.0), reference(2), np.full(500, 0.0)])
+    noisy = path + 1e-14 * np.random.default_rng(0).standard_normal(path.size)
+    assert np.array(find_moves(noisy, 1e-3)) == pytest.approx(np.array(find_moves(path, 1e-3)), abs=1e-9)
+
+
+@pytest.mark.parametrize("lap", [2.0, 2.00037, 2.0005])
+def test_laps_of_no_whole_number_of_periods_begin_at_the_same_moment(lap: float) -> None:
+    """Half a period is 50 um at this speed; what repeats to the bit must not scatter by it."""
+    time = np.arange(round(8 * lap * 1e3)) * 1e-3
+    path = 0.05 * (1.0 - np.cos(2.0 * np.pi * time / lap))
+    moves = [
+        Closure(a, b, "up" if k % 2 else "down") for k, (a, b) in enumerate(find_moves(path, 1e-3), start=1)
+    ]
+    trial = Trial("laps", 1e-3, path, {"encoder_position": (time, path)}, tuple(moves))
+
+    def scatter(one: Trial) -> float:
+        shortest = min(c.stop - c.start for c in one.closures)
+        phase = np.arange(0.01, shortest - 0.01, 1e-3)
+        curves = [[np.interp(c.start + phase, time, path) for c in one.of(name)] for name in one.conditions]
+        return max(float(np.std(own, axis=0).max()) for own in curves)
+
+    assert scatter(trial.aligned()) < 1e-7
+    if lap == 2.0:
+        assert trial.aligned() is trial
+    else:
+        assert scatter(trial) > 2e-5, "these laps show nothing"
+
+
+def test_what_is_no_shift_in_time_is_left_where_it_is() -> None:
+    time = np.arange(8000) * 1e-3
+    ever_more = 1.0 + 0.01 * np.floor(time / 2.0)
+    path = 0.05 * ever_more * (1.0 - np.cos(np.pi * time))
+    laps = tuple(Closure(2.0 * k, 2.0 * k + 2.0, "lap") for k in range(4))
+    trial = Trial("laps", 1e-3, path, {"encoder_position": (time, path)}, laps)
+    assert trial.aligned() is trial
 
 
 @pytest.mark.parametrize("digits", [5, 4, 3])

@@ -177,7 +177,8 @@ def prepare(
     typical  closures far from the others are left out already
     """
     if rig is not None:
-        trials = join_trials(check_trials(trials, (rig if isinstance(rig, type) else type(rig)).__name__))
+        checked = check_trials(trials, (rig if isinstance(rig, type) else type(rig)).__name__)
+        trials = [trial.aligned() for trial in join_trials(checked)]
     if not typical:
         trials = [without_outliers(trial) for trial in trials]
     hand = rig is None

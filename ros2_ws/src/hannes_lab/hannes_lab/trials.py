@@ -88,6 +88,12 @@ DIGIT = 0.25
 """A move between two stands is so many times faster than they are somewhere; and speeds are taken over so many samples
 that one last digit of the reference makes this part of a stand's limit: written with few digits it moves in steps."""
 
+STILL = 1e-6
+"""Part of a stand's limit up to which a speed is what rounding errors make of standing."""
+
+ALIGNED = 3.0
+"""Control periods by which closures of one condition may begin apart in their reference; see `Trial.aligned`."""
+
 EARLY = 0.1
 """s that a closure may begin before its recording: the reference stands there."""
 
@@ -251,6 +257,36 @@ class Trial:
         if apart(k) == 0.0:
             return k - skip
         return min(range(k - MOST_SHIFT, k + MOST_SHIFT + 1), key=lambda at: (apart(at), abs(at - k))) - skip
+
+    def aligned(self) -> Trial:
+        """The same, where each closure begins at the moment of its reference at which the first of its condition does.
+
+        Laps that do not last a whole number of control periods, or moves that were found in a reference with rounding
+        errors, begin up to a few periods earlier or later; at speed that is a distance, and no scatter of the machine.
+        Only what is a shift in time is taken away: one by up to ALIGNED periods that makes at least half of the
+        references' difference.
+        """
+        ticks = np.arange(self.reference.size) * self.period
+        slope = np.gradient(self.reference, self.period)
+        closures = list(self.closures)
+        for own in self.numbers.values():
+            first = closures[own[0]]
+            for k in own[1:]:
+                one = closures[k]
+                # Ends are left out: there the reference stands, or is that of the next move.
+                phase = np.arange(0.0, min(c.stop - c.start for c in (first, one)), self.period)[1:-1]
+                shape = np.interp(first.start + phase, ticks, self.reference)
+                before, late = np.interp(one.start + phase, ticks, self.reference) - shape, 0.0
+                for _ in range(3):
+                    at = one.start + late + phase
+                    rise = np.interp(at, ticks, slope)
+                    gain = float(rise @ rise)
+                    left = np.interp(at, ticks, self.reference) - shape
+                    late -= float(rise @ left) / gain if gain > 0.0 else 0.0
+                left = np.interp(one.start + late + phase, ticks, self.reference) - shape
+                if abs(late) <= ALIGNED * self.period and np.abs(left).sum() <= 0.5 * np.abs(before).sum():
+                    closures[k] = replace(one, start=one.start + late, stop=one.stop + late)
+        return self if closures == list(self.closures) else replace(self, closures=tuple(closures))
 
     def mean_closure(self, signal: str, phase: Array) -> Array:
         """Mean of a signal over the closures of the first condition at these times (p,) since their start [s]."""
@@ -416,7 +452,7 @@ def find_moves(reference: Array, period: float, *, slow: float = 0.1) -> list[tu
         if stands and speed[stands[-1][1] : first].max() < MOVING * limit:
             first = stands.pop()[0]
         stands.append((first, last))
-    still = [_stillest(speed[first : last + 1], first) for first, last in stands]
+    still = [_stillest(speed[first : last + 1], first, STILL * limit) for first, last in stands]
     if len(still) < 2:
         return []
     # The last stand begins no move, and may be of any length.
@@ -439,13 +475,14 @@ def _speed(reference: Array, period: float, slow: float) -> Array:
     return np.asarray(np.abs(reference[after] - reference[before]) / ((after - before) * period))
 
 
-def _stillest(speed: Array, offset: int) -> tuple[int, int]:
+def _stillest(speed: Array, offset: int, nearly: float) -> tuple[int, int]:
     """First and last index of the longest run of a stand (n,) in which the reference does not move at all.
 
     Of a turn without a rest, its slowest moment.
+
+    nearly  speed that rounding errors may make of standing
     """
-    slowest = int(np.argmin(speed))
-    longest = max(_runs(speed <= speed[slowest]), key=lambda run: run[1] - run[0])
+    longest = max(_runs(speed <= speed.min() + nearly), key=lambda run: run[1] - run[0])
     return longest[0] + offset, longest[1] + offset
 
 
