@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hannes_description.model import Model
 from hannes_lab.compare import compare
-from hannes_lab.depends import residual_dependences
+from hannes_lab.depends import _oscillation, residual_dependences, swings
 from hannes_lab.features import Features
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
@@ -65,14 +65,45 @@ def test_an_offset_depends_on_nothing_and_without_an_encoder_place_and_speed_are
         )
         return {d.variable: d.share for d in found}
 
+    def variables(shares: dict[str, float]) -> set[str]:
+        return set(shares) - {"frequency"}
+
     both = ("encoder_position", "motor_current")
     assert max(shares(lambda c: np.full_like(c, 0.2), features, *both).values()) < 1e-6
     of_load = shares(lambda c: 0.1 * c**2, features, *both)
     assert max(of_load, key=lambda name: of_load[name]) == "load" and of_load["load"] > 0.5
-    assert set(of_load) == {"position", "velocity", "direction", "load", "time"}
-    assert set(shares(lambda c: 0.1 * c**2, features, "motor_current")) == {"load", "time"}
+    assert variables(of_load) == {"position", "velocity", "direction", "load", "time"}
+    assert variables(shares(lambda c: 0.1 * c**2, features, "motor_current")) == {"load", "time"}
     without = shares(lambda c: 0.1 * c**2, features, "encoder_position")
-    assert set(without) == {"position", "velocity", "direction", "time"}, "no signal tells the load"
+    assert variables(without) == {"position", "velocity", "direction", "time"}, "no signal tells the load"
+
+
+def test_what_swings_at_one_frequency_whatever_the_speed_is_told_from_a_ripple_along_the_way() -> None:
+    rng = np.random.default_rng(4)
+    steps, sizes = (0.01, 0.02, 0.04), (150, 150, 140)
+
+    def closures(wave: Callable[[np.ndarray, float], np.ndarray]) -> list[np.ndarray]:
+        """Of three conditions, the second half as fast as the first, the third a quarter."""
+        return [
+            wave(np.arange(n) * step, step / 0.01) + 0.05 * rng.normal(size=(6, n))
+            for step, n in zip(steps, sizes, strict=True)
+        ]
+
+    def swing(t: np.ndarray, _: float) -> np.ndarray:
+        since = t % (0.5 * t[-1])
+        return np.exp(-2.0 * since) * np.sin(2.0 * np.pi * 5.7 * since)
+
+    swinging = closures(swing)
+    along = closures(lambda t, slower: np.sin(2.0 * np.pi * 9.0 * t / slower))
+    noise = closures(lambda t, _: 0.0 * t)
+    (swung,) = _oscillation("motor_current", swinging, steps)
+    assert swung.share > 0.5 and swung.at == pytest.approx(5.7, rel=0.06)
+    assert swung.centres[int(np.argmax(swung.curve))] == pytest.approx(5.7, rel=0.15)
+    assert "oscillates at 5." in swings([swung]) and swung.to_dict()["at"] == swung.at
+    (rippled,) = _oscillation("motor_current", along, steps)
+    assert rippled.share < 0.05 and swings([rippled]) == ""
+    assert all(d.share < 0.2 for d in _oscillation("motor_current", noise, steps))
+    assert _oscillation("motor_current", [c[:, :10] for c in swinging], steps) == []
 
 
 def test_what_a_fit_took_where_is_said() -> None:

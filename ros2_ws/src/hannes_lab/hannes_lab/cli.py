@@ -326,10 +326,7 @@ def _show_comparison(result: Comparison) -> None:
     show_table(table, TEXT_WIDTH)
     if result.metrics:
         console.print("Relative error: (measured - model) / measured.", style="dim")
-    console.print(
-        "The residual depends on: "
-        + ", ".join(f"{d.variable} {100 * d.share:.0f} %" for d in result.depends_on)
-    )
+    console.print("The residual depends on: " + ", ".join(d.said for d in result.depends_on))
     if math.isfinite(result.overall):
         console.print(f"Overall error: {number(result.overall)} times the repeatability between closures.")
     else:
@@ -444,10 +441,7 @@ def _show_diagnosis(found: Diagnosis, machine: str) -> None:
             console.print(f"  {100 * rank.explained:5.1f} %  {' + '.join(rank.names)}")
     _show_experiments(console, found.experiments)
     if found.verdict == "unknown":
-        console.print(
-            "\nThe rest depends on: "
-            + ", ".join(f"{d.variable} {100 * d.share:.0f} %" for d in found.depends_on)
-        )
+        console.print("\nThe rest depends on: " + ", ".join(d.said for d in found.depends_on))
     for note in found.notes:
         console.print(f"note: {note}", style="dim")
 

@@ -1,7 +1,8 @@
-"""What the residual depends on: position, velocity, direction, load or time, and how much of it each explains."""
+"""What the residual depends on: position, velocity, direction, load, time or frequency, and how much each explains."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +15,28 @@ from .features import Features
 Array = NDArray[np.float64]
 
 VARIABLES = ("position", "velocity", "direction", "load", "time")
+FREQUENCY = "frequency"
 BINS = 10
+BAND = 1.15
+"""A frequency is a band from so many times lower to so many times higher."""
+
+CYCLES = 4.0
+"""Least number of cycles in the shortest closure: what is slower is no oscillation, but its form."""
+
+FINE = 4
+"""Points of a spectrum for each that the closure's length tells apart."""
+
+FEWEST = 16
+"""Points of a closure from which there is a spectrum."""
+
+ROUNDING = 1e-12
+"""Part of a residual's square below which it does not vary."""
+
+WORTH_SAYING = 0.3
+"""Share of a frequency from which it is said in words."""
+
+ABOVE = 2.0
+"""Times that a mean residual's square must exceed what the closures' scatter makes of it, to show a frequency."""
 AT_REST = 1e-3
 """Part of the largest speed below which there is no direction."""
 
@@ -25,7 +47,8 @@ class Dependence:
 
     share    part of the variance of the closures' mean residual that the curve explains (adjusted R2), 0..1; an offset
              that is the same everywhere depends on nothing
-    centres  (b,) of the variable; curve (b,) mean residual, in the signal's unit
+    centres  (b,) of the variable; curve (b,) mean residual, in the signal's unit; of a frequency amplitudes
+    at       Hz, of a frequency: where it oscillates in all conditions
     """
 
     variable: str
@@ -33,9 +56,17 @@ class Dependence:
     share: float
     centres: tuple[float, ...]
     curve: tuple[float, ...]
+    at: float | None = None
+
+    @property
+    def said(self) -> str:
+        """The variable and its share, in words."""
+        where = "" if self.at is None or self.share == 0.0 else f" ({self.at:.2g} Hz)"
+        return f"{self.variable}{where} {100 * self.share:.0f} %"
 
     def to_dict(self) -> dict[str, Any]:
-        return {
+        where = {} if self.at is None else {"at": self.at}
+        return where | {
             "variable": self.variable,
             "signal": self.signal,
             "share": self.share,
@@ -49,7 +80,7 @@ def residual_dependences(
 ) -> tuple[Dependence, ...]:
     """What the residual of the drive's signal depends on, or of the first signal where none is recorded.
 
-    Without an encoder on load and time only; without a drive's signal not on the load, which that tells.
+    Without an encoder on load, time and frequency only; without a drive's signal not on the load, which that tells.
 
     drive   the signals that show force or torque, see Rig
     """
@@ -72,7 +103,81 @@ def residual_dependences(
                 states[name].append(np.tile(values, (target.n, 1)))
     # Of a set in which the encoder is not logged everywhere, what depends on it is not known.
     known = {name: values for name, values in states.items() if len(values) == len(places)}
-    return _dependences(residuals, known, signal)
+    steps = [float(by[place[0], place[1], signal][0].phase[1]) for place in places]
+    steps = [s - float(by[p[0], p[1], signal][0].phase[0]) for s, p in zip(steps, places, strict=True)]
+    found = [*_dependences(residuals, known, signal), *_oscillation(signal, residuals[signal], steps)]
+    return tuple(sorted(found, key=lambda d: -d.share))
+
+
+def swings(found: Sequence[Dependence]) -> str:
+    """A sentence where a residual goes with nothing as much as with one frequency; else empty."""
+    first = max(found, key=lambda d: d.share, default=None)
+    if first is None or first.variable != FREQUENCY or first.share < WORTH_SAYING or first.at is None:
+        return ""
+    return (
+        f"{100 * first.share:.0f} % of what is left of {first.signal} oscillates at {first.at:.2g} Hz in all "
+        "conditions, at whatever speed: something swings that the model takes for rigid (a shaft, a belt, a mount, "
+        "what hangs)"
+    )
+
+
+def _oscillation(signal: str, residuals: Sequence[Array], steps: Sequence[float]) -> list[Dependence]:
+    """What of a residual oscillates at one frequency whatever the condition: what swings does so at its own.
+
+    residuals  per condition block (n, p); steps  s between two phases of each
+    The share is the least of all conditions that show more than scatter, of the band of that frequency, without what
+    noise of all frequencies has there.  A ripple along the way has another frequency at each speed.
+    """
+    means = [r.mean(axis=0) for r in residuals]
+    noise = [r.var(axis=0, ddof=1).mean() / r.shape[0] if r.shape[0] > 1 else 0.0 for r in residuals]
+    seen = [
+        k
+        for k, (m, v) in enumerate(zip(means, noise, strict=True))
+        if m.size >= FEWEST and m.var() > max(ABOVE * v, ROUNDING * float(np.mean(m**2)))
+    ]
+    if not seen:
+        return []
+    lowest = max(CYCLES / (means[k].size * steps[k]) for k in seen) * BAND
+    highest = min(0.5 / steps[k] for k in seen) / BAND
+    if highest <= BAND * lowest:
+        return []
+    spectra = []
+    for k in seen:
+        power = (
+            np.abs(
+                np.fft.rfft((means[k] - means[k].mean()) * np.hanning(means[k].size), FINE * means[k].size)
+            )
+            ** 2
+        )
+        spectra.append((np.fft.rfftfreq(FINE * means[k].size, steps[k]), power, float(means[k].var())))
+
+    def share_in(low: float, high: float) -> list[float]:
+        out = []
+        for frequency, power, _ in spectra:
+            own = (frequency >= low) & (frequency <= high)
+            out.append(float(power[own].sum() / power.sum()) if power.sum() > 0.0 else 0.0)
+        return out
+
+    tried = np.geomspace(lowest, highest, 120)
+    least = []
+    for f in tried:
+        by_chance = [f * (BAND - 1.0 / BAND) / frequency[-1] for frequency, _, _ in spectra]
+        shares = zip(share_in(f / BAND, f * BAND), by_chance, strict=True)
+        least.append(min((s - c) / (1.0 - c) for s, c in shares))
+    best = int(np.argmax(least))
+    edges = np.geomspace(lowest / BAND, highest * BAND, 2 * BINS + 1)
+    curve = [
+        float(np.mean([np.sqrt(2.0 * s * v) for s, (_, _, v) in zip(share_in(a, b), spectra, strict=True)]))
+        for a, b in itertools.pairwise(edges)
+    ]
+    centres = tuple(float(v) for v in np.sqrt(edges[1:] * edges[:-1]))
+    share = float(np.clip(least[best], 0.0, 1.0))
+    # The band is wide, and where its share is largest is known badly; its middle by power is not.
+    middles = []
+    for frequency, power, _ in spectra:
+        own = (frequency >= tried[best] / BAND) & (frequency <= tried[best] * BAND)
+        middles.append(float(frequency[own] @ power[own] / max(power[own].sum(), 1e-300)))
+    return [Dependence(FREQUENCY, signal, share, centres, tuple(curve), float(np.median(middles)))]
 
 
 def _dependences(
@@ -122,5 +227,5 @@ def _dependence(variable: str, signal: str, x: Array, y: Array) -> Dependence:
     total, level = float(((y - y.mean()) ** 2).sum()), float((y**2).sum())
     k, n = len(centres), y.size
     # Of an offset alone rounding is left.
-    share = 1.0 - (inside / max(n - k, 1)) / (total / (n - 1)) if total > 1e-12 * level else 0.0
+    share = 1.0 - (inside / max(n - k, 1)) / (total / (n - 1)) if total > ROUNDING * level else 0.0
     return Dependence(variable, signal, float(np.clip(share, 0.0, 1.0)), tuple(centres), tuple(curve))

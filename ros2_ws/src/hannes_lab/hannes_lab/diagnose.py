@@ -29,7 +29,7 @@ from .choose import (
     tied_sets,
 )
 from .delays import in_time
-from .depends import residual_dependences
+from .depends import residual_dependences, swings
 from .diagnosis import Diagnosis, Fall, FoundEffect, ParameterEstimate
 from .errors import SignalError
 from .executor import Executor
@@ -144,6 +144,11 @@ def diagnose(
     effects = found_effects(search, best, intervals, falls)
     clock = other_clock(search.problem, best.fit) if greedy or verdict == "unknown" else None
     same = twins(search, best, far_off(best))
+    depends_on = residual_dependences(
+        prepared.features,
+        prepared.features.closures(prepared.rig, best.fit.model, best.fit.values),
+        prepared.rig.drive_signals,
+    )
     experiments = (
         separating_experiments(prepared, search, [search.fit_of(n) for n in tied]) if len(tied) > 1 else ()
     )
@@ -169,11 +174,7 @@ def diagnose(
         experiments=experiments,
         falls=falls,
         ranking=choice.ranking,
-        depends_on=residual_dependences(
-            prepared.features,
-            prepared.features.closures(prepared.rig, best.fit.model, best.fit.values),
-            prepared.rig.drive_signals,
-        ),
+        depends_on=depends_on,
         chance=limits,
         costs={"nominal_fitted": answer.null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
         nuisances=_nuisance_table(best.fit, intervals),
@@ -183,6 +184,7 @@ def diagnose(
             *((choice.left,) if choice.left and verdict != "unknown" else ()),
             *notes(search, best, verdict, effects, experiments, greedy, clock),
             *worse_fitted(falls),
+            *filter(None, (swings(depends_on) if verdict == "unknown" else "",)),
         ),
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
