@@ -6,7 +6,7 @@ import math
 import re
 
 import pytest
-from hannes_description.output import number, print_json, print_table, with_unit
+from hannes_description.output import estimate, number, print_json, print_table, with_unit
 
 ROWS = [
     ["friction.coulomb", 0.012345, "a sentence on where this number comes from, longer than a terminal"]
@@ -46,3 +46,11 @@ def test_what_is_not_a_number_is_a_dash_or_null(capsys: pytest.CaptureFixture[st
     print_json({"a": (math.nan, 1.0), 2: {"ü": -math.inf}})
     out = capsys.readouterr().out
     assert json.loads(out) == {"a": [None, 1.0], "2": {"ü": None}} and "ü" in out
+
+
+def test_an_interval_is_printed_with_digits_that_show_its_width() -> None:
+    assert estimate(5.9969, 5.9941, 5.9996, "Hz") == ("5.9969 Hz", "5.9941 .. 5.9996")
+    assert estimate(0.12, 0.05, 0.3, "1") == ("0.12", "0.05 .. 0.3")
+    assert estimate(1234.5678, 1234.5, 1234.6, "V") == ("1234.568 V", "1234.5 .. 1234.6")
+    assert estimate(0.0, 0.0, 0.0, "m") == ("0 m", "0 .. 0")
+    assert estimate(2.0, None, float("inf"), "m") == ("2 m", "- .. -")

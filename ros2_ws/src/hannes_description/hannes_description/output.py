@@ -49,6 +49,15 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     return number(value, digits) if unit in ("", "1") else f"{number(value, digits)} {unit}"
 
 
+def estimate(value: float, low: float | None, high: float | None, unit: str) -> tuple[str, str]:
+    """A value with its unit, and its interval, with two digits of the interval's half width and four at least."""
+    digits = 4
+    if low is not None and high is not None and math.isfinite(low) and math.isfinite(high) and low < high:
+        largest, half = max(abs(low), abs(high)), 0.5 * (high - low)
+        digits = min(8, max(digits, 2 + math.floor(math.log10(largest)) - math.floor(math.log10(half))))
+    return with_unit(value, unit, digits), f"{number(low, digits)} .. {number(high, digits)}"
+
+
 def text_console(width: int | None = None) -> Console:
     """Where text is printed: as wide as the terminal, or TEXT_WIDTH."""
     return Console(width=width or (None if sys.stdout.isatty() else TEXT_WIDTH), highlight=False)

@@ -13,7 +13,7 @@ from typing import Annotated, Any, cast
 import numpy as np
 import typer
 from hannes_description.errors import HannesError
-from hannes_description.output import number, print_json, text_console, with_unit
+from hannes_description.output import estimate, number, print_json, text_console
 from numpy.typing import NDArray
 
 from .cache import code_hash, content_hash, default_folder
@@ -299,9 +299,8 @@ def _show(found: Calibration) -> None:
     console = text_console()
     for p in found.parameters:
         note = "" if p.identified else "   not identified"
-        console.print(
-            f"{p.name} = {with_unit(p.value, p.unit)}   95 %: {number(p.low)} .. {number(p.high)}{note}"
-        )
+        value, span = estimate(p.value, p.low, p.high, p.unit)
+        console.print(f"{p.name} = {value}   95 %: {span}{note}")
     console.print(
         f"{found.agree} of {len(found.costs)} starts agree; {found.simulations} simulations, "
         f"{found.from_cache} from the cache."

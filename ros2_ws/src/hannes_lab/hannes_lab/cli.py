@@ -16,6 +16,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.output import (
     TEXT_WIDTH,
+    estimate,
     finite,
     number,
     print_json,
@@ -425,9 +426,8 @@ def _show_diagnosis(found: Diagnosis, machine: str) -> None:
         console.print(f"\n[bold]{effect.title}[/bold] ({effect.name})")
         for name, p in effect.parameters.items():
             note = "" if p.identified else "   not identified by these data"
-            console.print(
-                f"  {name} = {with_unit(p.value, p.unit)}   95 %: {number(p.low)} .. {number(p.high)}{note}"
-            )
+            value, span = estimate(p.value, p.low, p.high, p.unit)
+            console.print(f"  {name} = {value}   95 %: {span}{note}")
         console.print(f"  {effect.why}")
     _show_falls(console, found, machine)
     if found.ranking and not has_excess(found.costs, bool(found.effects)):
@@ -558,10 +558,8 @@ def add(
 def _show_addition(found: Addition, machine: str) -> None:
     console = text_console()
     for effect in found.effects:
-        values = ", ".join(
-            f"{n} = {with_unit(p.value, p.unit)} ({number(p.low, 3)} .. {number(p.high, 3)})"
-            for n, p in effect.parameters.items()
-        )
+        known = {n: estimate(p.value, p.low, p.high, p.unit) for n, p in effect.parameters.items()}
+        values = ", ".join(f"{n} = {value} ({span})" for n, (value, span) in known.items())
         console.print(f"[bold]{effect.title}[/bold]: {values}")
     _show_falls(console, found, machine)
     for note in found.notes:

@@ -32,7 +32,7 @@ FEWEST = 16
 ROUNDING = 1e-12
 """Part of a residual's square below which it does not vary."""
 
-WORTH_SAYING = 0.3
+WORTH_SAYING = 0.2
 """Share of a frequency from which it is said in words."""
 
 ABOVE = 2.0

@@ -1,0 +1,81 @@
+"""An effect of one's own that the project shows: a load on an elastic shaft, and how a diagnosis leads to it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hannes_description.model import Model
+from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.rig import load_rig
+from lab.single_mass_rig import Law, write_files
+
+ADAPTER = f"{Path(__file__).parent / 'single_mass_rig.py'}:SingleMass"
+SHOWN = Path(__file__).parents[2] / "examples" / "effects" / "elastic_load.py"
+WHOLE, PART, HERTZ, DAMPING = 2.1, 0.7, 6.0, 0.04
+
+
+def quick(laps: int = 6) -> np.ndarray:
+    """Ramps of 0.1 m in 0.2 s there and in 0.5 s back, with stands of 1 s."""
+    there, back = np.linspace(0.0, 0.1, 200), np.linspace(0.1, 0.0, 500)
+    lap = np.concatenate([there, np.full(1000, 0.1), back, np.zeros(1000)])
+    return np.concatenate([np.zeros(1000), *[lap] * laps])
+
+
+def recorded(folder: Path) -> Path:
+    """The single mass of 2.1 kg of which 0.7 kg hang on a spring: two masses, in steps of 20 us."""
+    write_files(folder)
+    gain, brake = Law(None, 1e-3).parameters
+    wanted = quick()
+    rate = 2.0 * math.pi * HERTZ
+    spring, damper = PART * rate**2, 2.0 * DAMPING * PART * rate
+    step, q, v, y, w = 2e-5, 0.0, 0.0, 0.0, 0.0
+    position, force = np.zeros(wanted.size), np.zeros(wanted.size)
+    before = 0.0
+    for k, target in enumerate(wanted):
+        position[k] = q
+        force[k] = gain * (target - q) - brake * (q - before) / 1e-3
+        before = q
+        for _ in range(50):
+            pull = spring * (q - y) + damper * (v - w)
+            v, w = v + step * (force[k] - pull - 5.0 * v) / (WHOLE - PART), w + step * pull / PART
+            q, y = q + step * v, y + step * w
+    rng = np.random.default_rng(1)
+    path = folder / "mass.npz"
+    noisy = position + 2e-6 * rng.standard_normal(wanted.size)
+    np.savez(path, reference=wanted, position=noisy, force=force + 0.02 * rng.standard_normal(wanted.size))
+    return path
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+    path = recorded(tmp_path_factory.mktemp("elastic"))
+    rig = load_rig(ADAPTER)
+    return prepare(rig.read([path]), Model.load(path.parent / "mass.yaml"), rig=rig)
+
+
+def test_what_swings_is_unknown_and_its_frequency_is_said(prepared: Prepared) -> None:
+    only = ["coulomb_friction", "cogging", "command_delay", "gearbox_inertia"]
+    found = diagnose(prepared, effect_sources(only=only, model=prepared.model))
+    assert found.verdict == "unknown"
+    first = found.depends_on[0]
+    # Of the whole machine in its loop: the load's own frequency with the motor held is a little lower.
+    assert first.variable == "frequency" and first.at is not None and HERTZ * 0.9 < first.at < HERTZ * 1.5
+    assert any("oscillates at" in note for note in found.notes)
+
+
+def test_with_the_effect_that_is_shown_it_is_found(prepared: Prepared, tmp_path: Path) -> None:
+    mine = tmp_path / "elastic.py"
+    text = SHOWN.read_text().replace("INERTIA = 0.04\n", "INERTIA = 0.5\n")
+    mine.write_text(text.replace("FREQUENCY = 6.0\n", "FREQUENCY = 7.0\n"))
+    source = f"{mine}:ElasticLoad"
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction", source], model=prepared.model))
+    (effect,) = found.effects
+    assert effect.name == "elastic_load"
+    for name, true in (("inertia", PART), ("frequency", HERTZ), ("damping", DAMPING)):
+        p = effect.parameters[name]
+        assert p.low <= true <= p.high or p.value == pytest.approx(true, rel=0.03), name
+    assert found.falls[-1].held_out < 0.05 * found.falls[1].held_out
