@@ -179,12 +179,12 @@ def diagnose(
         costs={"nominal_fitted": answer.null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
         nuisances=_nuisance_table(best.fit, intervals),
         notes=(
+            *filter(None, (swings(depends_on) if verdict == "unknown" else "",)),
             *prepared.notes,
             *choice.notes,
             *((choice.left,) if choice.left and verdict != "unknown" else ()),
             *notes(search, best, verdict, effects, experiments, greedy, clock),
             *worse_fitted(falls),
-            *filter(None, (swings(depends_on) if verdict == "unknown" else "",)),
         ),
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
@@ -309,7 +309,8 @@ def _idle_at_the_end(
 
 def _may_be_nought(search: Search, found: Candidate, limits: Chance) -> bool:
     """Whether the 95 % intervals of all strengths of the last effect hold the value at which it vanishes."""
-    name, intervals = found.names[-1], intervals_of(found.fit, limits)
+    name = found.names[-1]
+    intervals = intervals_of(found.fit, limits, sway(search.problem, found.fit))
     return all(
         intervals[f"{name}.{p.name}"][0] <= p.vanishing <= intervals[f"{name}.{p.name}"][1]
         for p in search.effect(name).parameters

@@ -51,8 +51,10 @@ class Cogging(Effect):
         angle = 2.0 * math.pi * x[Q] / p[2]
         amplitude = math.sqrt(p[0] * p[0] + p[1] * p[1])
         if amplitude > 0.0:
-            sine = (p[0] * math.sin(angle) + p[1] * math.cos(angle)) / amplitude
-            cosine = (p[0] * math.cos(angle) - p[1] * math.sin(angle)) / amplitude
+            # Once each: they take longer than the rest of a step.
+            up, across = math.sin(angle), math.cos(angle)
+            sine = (p[0] * up + p[1] * across) / amplitude
+            cosine = (p[0] * across - p[1] * up) / amplitude
             second = p[3] * 2.0 * sine * cosine + p[4] * (1.0 - 2.0 * sine * sine)
             third = p[5] * sine * (3.0 - 4.0 * sine * sine) + p[6] * cosine * (4.0 * cosine * cosine - 3.0)
             y[TORQUE] += amplitude * (sine + second + third)
