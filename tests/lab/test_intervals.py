@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,6 +24,11 @@ from hannes_sim.effect import EffectParameter, load_effect
 
 SIZE, CONDITIONS = 60, ("slow", "fast", "grasp")
 SLOPE = Coordinate("slope", 0.0, 1.0, False, -np.inf, np.inf, False, 0.1)
+
+
+@cache
+def nominal() -> Model:
+    return Model.load()
 
 
 class Thirds:
@@ -49,7 +55,7 @@ def line_fit(shift: dict[str, float], seed: int) -> tuple[Fit, dict[str, dict[st
     every = np.ones(SIZE, dtype=bool)
     z = np.array([slope(every)])
     residual = y - z[0] * x
-    found = Fit(Model.load(), (SLOPE,), z, float(residual @ residual), residual, -x[:, None])
+    found = Fit(nominal(), (SLOPE,), z, float(residual @ residual), residual, -x[:, None])
     left_out = {c: {"slope": slope(~features.rows(c))} for c in CONDITIONS}
     return found, left_out, limits()
 
@@ -101,7 +107,7 @@ def lap_fit(scatter: float, seed: int) -> tuple[Any, Fit]:
     along, measured = x.ravel() / one, closures.mean(axis=0).ravel() / one
     z = np.array([along @ measured / (along @ along)])
     residual = measured - z[0] * along
-    return problem, Fit(Model.load(), (SLOPE,), z, float(residual @ residual), residual, -along[:, None])
+    return problem, Fit(nominal(), (SLOPE,), z, float(residual @ residual), residual, -along[:, None])
 
 
 def test_scatter_that_moves_whole_laps_widens_the_interval_until_it_holds_the_truth() -> None:

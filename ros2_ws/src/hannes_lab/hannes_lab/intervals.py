@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from .chance import Chance
 from .features import Features
@@ -92,7 +92,7 @@ def sway(problem: Problem, found: Fit) -> dict[str, float]:
         variance += part
         by_freedom += part**2 / (counts[trial] - 1.0)
     freedom = variance**2 / np.maximum(by_freedom, 1e-12 * variance**2)
-    ratios = np.sqrt(variance / np.diag(inverse)) * student_t.ppf(0.975, freedom) / NORMAL
+    ratios = np.sqrt(variance / np.diag(inverse)) * stdtrit(freedom, 0.975) / NORMAL
     return {c.name: max(1.0, float(r)) for c, r in zip(found.coordinates, ratios, strict=True)}
 
 
