@@ -104,6 +104,7 @@ def test_what_swings_at_one_frequency_whatever_the_speed_is_told_from_a_ripple_a
     assert rippled.share < 0.05 and swings([rippled]) == ""
     assert all(d.share < 0.2 for d in _oscillation("motor_current", noise, steps))
     assert _oscillation("motor_current", [c[:, :10] for c in swinging], steps) == []
+    assert _oscillation("motor_current", swinging[:1], steps[:1]) == [], "one speed cannot tell"
 
 
 def test_what_a_fit_took_where_is_said() -> None:

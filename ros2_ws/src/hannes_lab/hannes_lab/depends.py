@@ -23,6 +23,9 @@ BAND = 1.15
 CYCLES = 4.0
 """Least number of cycles in the shortest closure: what is slower is no oscillation, but its form."""
 
+OTHER_SPEED = 1.25
+"""Times that the longest closure lasts at least as long as the shortest, so that they go at different speeds."""
+
 FINE = 4
 """Points of a spectrum for each that the closure's length tells apart."""
 
@@ -121,63 +124,77 @@ def swings(found: Sequence[Dependence]) -> str:
     )
 
 
+@dataclass(frozen=True)
+class _Spectrum:
+    """Of the mean residual of a condition: frequency (m,) [Hz], power (m,) of sum 1, and its variance."""
+
+    frequency: Array
+    power: Array
+    variance: float
+
+    def within(self, low: float, high: float) -> NDArray[np.bool_]:
+        inside: NDArray[np.bool_] = (self.frequency >= low) & (self.frequency <= high)
+        return inside
+
+    def share(self, low: float, high: float) -> float:
+        return float(self.power[self.within(low, high)].sum())
+
+    def stands_out(self, f: float) -> float:
+        """Share of the band of a frequency without what noise of all frequencies has there."""
+        by_chance = f * (BAND - 1.0 / BAND) / float(self.frequency[-1])
+        return (self.share(f / BAND, f * BAND) - by_chance) / (1.0 - by_chance)
+
+    def middle(self, f: float) -> float:
+        """Of the band of a frequency, by power: where its share is largest is known badly."""
+        own = self.within(f / BAND, f * BAND)
+        return float(self.frequency[own] @ self.power[own] / max(self.power[own].sum(), 1e-300))
+
+
+def _spectrum(closures: Array, step: float) -> _Spectrum | None:
+    """Of closures' (n, p) mean residual at phases that are `step` s apart; None where it shows no more than scatter."""
+    n, p = closures.shape
+    mean = closures.mean(axis=0)
+    noise = closures.var(axis=0, ddof=1).mean() / n if n > 1 else 0.0
+    if p < FEWEST or mean.var() <= max(ABOVE * noise, ROUNDING * float(np.mean(mean**2))):
+        return None
+    power = np.abs(np.fft.rfft((mean - mean.mean()) * np.hanning(p), FINE * p)) ** 2
+    frequency: Array = np.asarray(np.fft.rfftfreq(FINE * p, step), dtype=np.float64)
+    return _Spectrum(frequency, power / power.sum(), float(mean.var()))
+
+
 def _oscillation(signal: str, residuals: Sequence[Array], steps: Sequence[float]) -> list[Dependence]:
     """What of a residual oscillates at one frequency whatever the condition: what swings does so at its own.
 
     residuals  per condition block (n, p); steps  s between two phases of each
-    The share is the least of all conditions that show more than scatter, of the band of that frequency, without what
-    noise of all frequencies has there.  A ripple along the way has another frequency at each speed.
+    The share is the least of all conditions that show more than scatter.  A ripple along the way has another frequency
+    at each speed: conditions of one length cannot tell.
     """
-    means = [r.mean(axis=0) for r in residuals]
-    noise = [r.var(axis=0, ddof=1).mean() / r.shape[0] if r.shape[0] > 1 else 0.0 for r in residuals]
-    seen = [
-        k
-        for k, (m, v) in enumerate(zip(means, noise, strict=True))
-        if m.size >= FEWEST and m.var() > max(ABOVE * v, ROUNDING * float(np.mean(m**2)))
-    ]
-    if not seen:
+    found = [(_spectrum(r, step), r.shape[1] * step) for r, step in zip(residuals, steps, strict=True)]
+    spectra = [s for s, _ in found if s is not None]
+    lengths = [length for s, length in found if s is not None]
+    if not spectra or max(lengths) < OTHER_SPEED * min(lengths):
         return []
-    lowest = max(CYCLES / (means[k].size * steps[k]) for k in seen) * BAND
-    highest = min(0.5 / steps[k] for k in seen) / BAND
+    lowest = BAND * CYCLES / min(lengths)
+    highest = min(float(s.frequency[-1]) for s in spectra) / BAND
     if highest <= BAND * lowest:
         return []
-    spectra = []
-    for k in seen:
-        power = (
-            np.abs(
-                np.fft.rfft((means[k] - means[k].mean()) * np.hanning(means[k].size), FINE * means[k].size)
-            )
-            ** 2
-        )
-        spectra.append((np.fft.rfftfreq(FINE * means[k].size, steps[k]), power, float(means[k].var())))
-
-    def share_in(low: float, high: float) -> list[float]:
-        out = []
-        for frequency, power, _ in spectra:
-            own = (frequency >= low) & (frequency <= high)
-            out.append(float(power[own].sum() / power.sum()) if power.sum() > 0.0 else 0.0)
-        return out
-
     tried = np.geomspace(lowest, highest, 120)
-    least = []
-    for f in tried:
-        by_chance = [f * (BAND - 1.0 / BAND) / frequency[-1] for frequency, _, _ in spectra]
-        shares = zip(share_in(f / BAND, f * BAND), by_chance, strict=True)
-        least.append(min((s - c) / (1.0 - c) for s, c in shares))
+    least = [min(s.stands_out(f) for s in spectra) for f in tried]
     best = int(np.argmax(least))
     edges = np.geomspace(lowest / BAND, highest * BAND, 2 * BINS + 1)
-    curve = [
-        float(np.mean([np.sqrt(2.0 * s * v) for s, (_, _, v) in zip(share_in(a, b), spectra, strict=True)]))
-        for a, b in itertools.pairwise(edges)
+    return [
+        Dependence(
+            FREQUENCY,
+            signal,
+            share=float(np.clip(least[best], 0.0, 1.0)),
+            centres=tuple(float(v) for v in np.sqrt(edges[1:] * edges[:-1])),
+            curve=tuple(
+                float(np.mean([np.sqrt(2.0 * s.share(a, b) * s.variance) for s in spectra]))
+                for a, b in itertools.pairwise(edges)
+            ),
+            at=float(np.median([s.middle(tried[best]) for s in spectra])),
+        )
     ]
-    centres = tuple(float(v) for v in np.sqrt(edges[1:] * edges[:-1]))
-    share = float(np.clip(least[best], 0.0, 1.0))
-    # The band is wide, and where its share is largest is known badly; its middle by power is not.
-    middles = []
-    for frequency, power, _ in spectra:
-        own = (frequency >= tried[best] / BAND) & (frequency <= tried[best] * BAND)
-        middles.append(float(frequency[own] @ power[own] / max(power[own].sum(), 1e-300)))
-    return [Dependence(FREQUENCY, signal, share, centres, tuple(curve), float(np.median(middles)))]
 
 
 def _dependences(
