@@ -26,7 +26,7 @@ from hannes_lab.rig import Nuisance, load_rig, scaled_effect, unit_factor
 from hannes_lab.screen import usable_effects
 from hannes_lab.search import Candidate, Search
 from hannes_lab.spectrum import position_periods
-from hannes_lab.trials import Closure, Trial, find_moves
+from hannes_lab.trials import SAME, Closure, Trial, find_moves
 from hannes_sim.effect import EffectParameter, catalogue, load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.rollout import rollout
@@ -118,6 +118,43 @@ def test_laps_of_no_whole_number_of_periods_begin_at_the_same_moment(lap: float)
         assert trial.aligned() is trial
     else:
         assert scatter(trial) > 2e-5, "these laps show nothing"
+
+
+def test_laps_that_begin_a_part_of_a_period_later_are_no_copies_of_one_another(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half a period is 80 um in the middle of these moves, of which the machine itself repeats to 2."""
+    lap, noise = 2.00037, 2e-6
+    time = np.arange(round(8 * lap * 1e3)) * 1e-3
+    turn = np.mod(time, lap) / lap
+
+    def way(u: np.ndarray) -> np.ndarray:
+        u = np.clip(u, 0.0, 1.0)
+        return u - np.sin(2.0 * np.pi * u) / (2.0 * np.pi)
+
+    path = 0.1 * (way((turn - 0.1) / 0.3) - way((turn - 0.6) / 0.3))
+    model, rig = Model.load(recording.parent / "mass.yaml"), load_rig(ADAPTER)
+    monkeypatch.setattr(rig, "population", recording.parent / "tolerances.yaml")
+    run = rollout(make_plant(model), rig([]).controller(model, 1e-3), path)
+    position = run.encoder_position + noise * np.random.default_rng(0).standard_normal(time.size)
+    moves = [
+        Closure(a, b, "up" if path[round(b / 1e-3)] > 0.05 else "down") for a, b in find_moves(path, 1e-3)
+    ]
+    trial = Trial(
+        "laps",
+        1e-3,
+        path,
+        {"encoder_position": (time, position)},
+        tuple(moves),
+        units={"encoder_position": "m"},
+    )
+
+    def error() -> float:
+        return compare(prepare([trial], model, rig=rig)).overall
+
+    assert error() < 1.2
+    monkeypatch.setattr(rig, "same", SAME)
+    assert error() > 3.0, "these laps show nothing"
 
 
 def test_what_is_no_shift_in_time_is_left_where_it_is() -> None:

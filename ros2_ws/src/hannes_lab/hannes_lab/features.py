@@ -288,11 +288,16 @@ def has_memory(model: Model) -> bool:
 
 
 def build_features(
-    trials: Sequence[Trial], signals: Sequence[str], points: int = MAX_PHASES, finest: float = FINEST
+    trials: Sequence[Trial],
+    signals: Sequence[str],
+    points: int = MAX_PHASES,
+    finest: float = FINEST,
+    same: float = SAME,
 ) -> Features:
     """The operator for these trials and signals, with at most `points` phases to a closure.
 
     finest  see Block
+    same    see Rig
     Raises HannesError where no trial has any of the signals.
     """
     blocks: list[Block] = []
@@ -310,7 +315,7 @@ def build_features(
         raise HannesError(
             f"None of the signals {', '.join(signals)} covers a whole closure in these recordings."
         )
-    nearly = [k for k, end in enumerate(ends) if end is not None and compact_end(trials[k], SAME) is None]
+    nearly = [k for k, end in enumerate(ends) if end is not None and compact_end(trials[k], same) is None]
     return Features(tuple(trials), tuple(blocks), tuple(ends), tuple(nearly))
 
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD, later, moved, moving_mean
 from .features import FINEST, Block
 from .rig import Nuisance, PlantRig, make_controller
-from .trials import Trial
+from .trials import SAME, Trial
 
 __all__ = ["HandRig", "make_controller", "object_of", "sensors_of"]
 
@@ -253,6 +253,7 @@ class HandRig(PlantRig):
     machine = "hand"
     figures = True
     foreign = False  # what does not describe itself has an error of the model's own
+    same = SAME
     experiments = True
 
     def __init__(self, trials: Sequence[Trial]) -> None:

@@ -190,7 +190,7 @@ def prepare(
         trials = with_seen_objects(with_one_clock(trials, model), model)
         rig = HandRig(trials)
     told = [] if isinstance(rig, HandRig) else check_rig(rig, model)
-    features = build_features(trials, _present(trials, signals), rig.points, rig.finest)
+    features = build_features(trials, _present(trials, signals), rig.points, rig.finest, rig.same)
     nuisances = tuple(rig.nuisances(model))
     coordinates = [nuisance_coordinate(n) for n in nuisances]
     view = rig_for(rig, model, coordinates, threads) if surrogate else rig

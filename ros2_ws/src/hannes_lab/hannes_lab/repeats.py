@@ -9,7 +9,7 @@ from hannes_sim.ports import R_Q, R_QL
 from hannes_sim.rollout import Rollout
 from numpy.typing import NDArray
 
-from .trials import SAME, Trial
+from .trials import Trial
 
 Array = NDArray[np.float64]
 
@@ -49,13 +49,16 @@ def few(trial: Trial) -> int:
     return 1 + max(k for own in trial.numbers.values() for k in own[:FEW])
 
 
-def few_will_do(trial: Trial) -> bool:
-    """Whether that is much less than the whole, and the others have the same reference, in the same order."""
+def few_will_do(trial: Trial, same: float) -> bool:
+    """Whether that is much less than the whole, and the others have the same reference, in the same order.
+
+    same  see Rig
+    """
     count = few(trial)
     return (
         count < len(trial.closures)
         and end_of(trial, count) < WORTH * trial.reference.size
-        and trial.apart <= SAME
+        and trial.apart <= same
         and trial.in_turn
     )
 

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from .clock import REFERENCE_DELAY, moved
 from .repeats import came_back, end_of, few, few_will_do, repeated
-from .trials import SAME, Trial
+from .trials import EXACTLY, SAME, Trial
 
 if TYPE_CHECKING:
     from .features import Block
@@ -99,6 +99,7 @@ class Rig(Protocol):
     floor     smallest standard deviation of a sample, relative to the span of its signal, that the simulation of a
               logged reference can promise
     points    points of the phase grid of one closure at most
+    same      mean difference of the references of two closures, in their span, up to which one is a copy of the other
     without   effects that have no meaning on this machine, with the reason
     drive_signals  signals that tell force or torque of the drive
     phases    other names for the phases void, grasp, hold, opening, rest
@@ -114,6 +115,7 @@ class Rig(Protocol):
     trials: tuple[Trial, ...]
     floor: float
     points: int
+    same: float
     drive_signals: tuple[str, ...]
     pooled: bool
     approximate: bool
@@ -179,6 +181,7 @@ class PlantRig:
     known: ClassVar[Mapping[str, float]] = {}
     floor: float = 2e-4  # replay of a reference logged by messages, and a plant of finite step
     points: int = 160
+    same: float = EXACTLY
     drive_signals: tuple[str, ...] = ("motor_current", "motor_effort")
     pooled: bool = False
     approximate: bool = False
@@ -351,7 +354,7 @@ class PlantRig:
 
     def _longer(self, model: Model, values: Mapping[str, float], trial: Trial) -> dict[str, Array]:
         """Signals of the whole trial, where the second closure does not end as the first did."""
-        if few_will_do(trial):
+        if few_will_do(trial, self.same):
             self._came_back = True
             signals = self.observed(model, values, trial, trial.reference[: end_of(trial, few(trial))])
             if self._came_back:

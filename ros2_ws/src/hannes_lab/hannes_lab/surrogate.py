@@ -64,7 +64,7 @@ class AnchoredRig:
         self._ends = ends or {trial.name: compact_end(trial) for trial in exact.trials}
         self.trials = exact.trials
         self.floor, self.finest = exact.floor, exact.finest
-        self.points, self.pooled = exact.points, exact.pooled
+        self.points, self.same, self.pooled = exact.points, exact.same, exact.pooled
         self.approximate, self.foreign = True, exact.foreign
         self.drive_signals, self.without = exact.drive_signals, exact.without
         self.phases, self.figures, self.experiments = exact.phases, exact.figures, exact.experiments

@@ -75,7 +75,12 @@ MOST_TOLD = 4
 """Gaps that are told one by one."""
 
 SAME = 5e-4
-"""Mean difference of the references of two closures, in their span, up to which one repeats the other."""
+"""Mean difference of the references of two closures, in their span, up to which one repeats the other: a reference that
+was logged by messages may be seen a control period earlier or later from closure to closure."""
+
+EXACTLY = 1e-9
+"""The same where a reference is known tick by tick: rounding errors.  Laps that begin a part of a period later differ
+by more, and are not to be copied from one another as they are."""
 
 MOST_SHIFT = 15
 """Ticks by which a closure may begin earlier or later than where its reference was seen to move."""
