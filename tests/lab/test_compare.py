@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hannes_description.model import Model
 from hannes_lab.compare import compare
-from hannes_lab.depends import _oscillation, residual_dependences, swings
+from hannes_lab.depends import _dependences, _oscillation, pointed_at, residual_dependences
 from hannes_lab.features import Features
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
@@ -66,7 +66,7 @@ def test_an_offset_depends_on_nothing_and_without_an_encoder_place_and_speed_are
         return {d.variable: d.share for d in found}
 
     def variables(shares: dict[str, float]) -> set[str]:
-        return set(shares) - {"frequency"}
+        return set(shares) - {"frequency", "friction_by_position"}
 
     both = ("encoder_position", "motor_current")
     assert max(shares(lambda c: np.full_like(c, 0.2), features, *both).values()) < 1e-6
@@ -76,6 +76,22 @@ def test_an_offset_depends_on_nothing_and_without_an_encoder_place_and_speed_are
     assert variables(shares(lambda c: 0.1 * c**2, features, "motor_current")) == {"load", "time"}
     without = shares(lambda c: 0.1 * c**2, features, "encoder_position")
     assert variables(without) == {"position", "velocity", "direction", "time"}, "no signal tells the load"
+
+
+def test_what_brakes_at_a_place_both_ways_is_told_though_its_mean_there_is_nothing() -> None:
+    """A belt that rubs where it is spliced: along the position alone there is nothing to see."""
+    there = np.linspace(0.0, 1.0, 200)
+    position = np.concatenate([there, there[::-1]])
+    velocity = np.concatenate([np.full(200, 0.3), np.full(200, -0.3)])
+    rubs = 0.2 * np.sign(velocity) * np.exp(-(((position - 0.6) / 0.08) ** 2))
+    states = {"position": [position[None]], "velocity": [velocity[None]], "direction": [velocity[None]]}
+    shares = {d.variable: d for d in _dependences({"drive_force": [rubs[None]]}, states, "drive_force")}
+    assert shares["friction_by_position"].share > 0.7 and shares["position"].share < 0.05
+    curve = shares["friction_by_position"]
+    assert curve.centres[int(np.argmax(curve.curve))] == pytest.approx(0.6, abs=0.08)
+    assert max(curve.curve) > 0.12 and "friction by position (0." in curve.said
+    assert "either way, most at 0." in pointed_at([curve])
+    assert pointed_at([replace(curve, at=curve.centres[0])]) == "", "there it turns"
 
 
 def test_what_swings_at_one_frequency_whatever_the_speed_is_told_from_a_ripple_along_the_way() -> None:
@@ -99,9 +115,9 @@ def test_what_swings_at_one_frequency_whatever_the_speed_is_told_from_a_ripple_a
     (swung,) = _oscillation("motor_current", swinging, steps)
     assert swung.share > 0.5 and swung.at == pytest.approx(5.7, rel=0.06)
     assert swung.centres[int(np.argmax(swung.curve))] == pytest.approx(5.7, rel=0.15)
-    assert "oscillates at 5." in swings([swung]) and swung.to_dict()["at"] == swung.at
+    assert "oscillates at 5." in pointed_at([swung]) and swung.to_dict()["at"] == swung.at
     (rippled,) = _oscillation("motor_current", along, steps)
-    assert rippled.share < 0.05 and swings([rippled]) == ""
+    assert rippled.share < 0.05 and pointed_at([rippled]) == ""
     assert all(d.share < 0.2 for d in _oscillation("motor_current", noise, steps))
     assert _oscillation("motor_current", [c[:, :10] for c in swinging], steps) == []
     assert _oscillation("motor_current", swinging[:1], steps[:1]) == [], "one speed cannot tell"

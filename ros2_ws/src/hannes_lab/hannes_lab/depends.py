@@ -1,10 +1,10 @@
-"""What the residual depends on: position, velocity, direction, load, time or frequency, and how much each explains."""
+"""What the residual depends on: position, velocity, direction, load, time, friction by position, or one frequency."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 
 VARIABLES = ("position", "velocity", "direction", "load", "time")
 FREQUENCY = "frequency"
+BRAKING = "friction_by_position"
+"""What acts against the motion, by where: its mean over both directions is nothing."""
+
 BINS = 10
 BAND = 1.15
 """A frequency is a band from so many times lower to so many times higher."""
@@ -51,7 +54,7 @@ class Dependence:
     share    part of the variance of the closures' mean residual that the curve explains (adjusted R2), 0..1; an offset
              that is the same everywhere depends on nothing
     centres  (b,) of the variable; curve (b,) mean residual, in the signal's unit; of a frequency amplitudes
-    at       Hz, of a frequency: where it oscillates in all conditions
+    at       where it oscillates in all conditions [Hz], or where what acts against the motion is largest; in `at_unit`
     """
 
     variable: str
@@ -60,15 +63,16 @@ class Dependence:
     centres: tuple[float, ...]
     curve: tuple[float, ...]
     at: float | None = None
+    at_unit: str = ""
 
     @property
     def said(self) -> str:
         """The variable and its share, in words."""
-        where = "" if self.at is None or self.share == 0.0 else f" ({self.at:.2g} Hz)"
-        return f"{self.variable}{where} {100 * self.share:.0f} %"
+        where = "" if self.at is None or self.share == 0.0 else f" ({self.at:.2g} {self.at_unit})"
+        return f"{self.variable.replace('_', ' ')}{where} {100 * self.share:.0f} %"
 
     def to_dict(self) -> dict[str, Any]:
-        where = {} if self.at is None else {"at": self.at}
+        where = {} if self.at is None else {"at": self.at, "at_unit": self.at_unit}
         return where | {
             "variable": self.variable,
             "signal": self.signal,
@@ -108,20 +112,32 @@ def residual_dependences(
     known = {name: values for name, values in states.items() if len(values) == len(places)}
     steps = [float(by[place[0], place[1], signal][0].phase[1]) for place in places]
     steps = [s - float(by[p[0], p[1], signal][0].phase[0]) for s, p in zip(steps, places, strict=True)]
-    found = [*_dependences(residuals, known, signal), *_oscillation(signal, residuals[signal], steps)]
+    unit = next((b.unit for b in features.blocks if b.signal == "encoder_position"), "")
+    found = [*_dependences(residuals, known, signal, unit), *_oscillation(signal, residuals[signal], steps)]
     return tuple(sorted(found, key=lambda d: -d.share))
 
 
-def swings(found: Sequence[Dependence]) -> str:
-    """A sentence where a residual goes with nothing as much as with one frequency; else empty."""
-    first = max(found, key=lambda d: d.share, default=None)
-    if first is None or first.variable != FREQUENCY or first.share < WORTH_SAYING or first.at is None:
-        return ""
-    return (
-        f"{100 * first.share:.0f} % of what is left of {first.signal} oscillates at {first.at:.2g} Hz in all "
-        "conditions, at whatever speed: something swings that the model takes for rigid (a shaft, a belt, a mount, "
-        "what hangs)"
-    )
+def pointed_at(found: Sequence[Dependence]) -> str:
+    """A sentence where a residual goes with one frequency, or friction at a place, as with nothing else; or empty.
+
+    Where the way ends the machine turns, and all that has to do with starts and stops is largest there.
+    """
+    for first in sorted(found, key=lambda d: -d.share):
+        if first.at is None or first.share < WORTH_SAYING:
+            return ""
+        what = f"{100 * first.share:.0f} % of what is left of {first.signal}"
+        where = f"{first.at:.2g} {first.at_unit}"
+        if first.variable == FREQUENCY:
+            return (
+                f"{what} oscillates at {where} in all conditions, at whatever speed: something swings that the model "
+                "takes for rigid (a shaft, a belt, a mount, what hangs)"
+            )
+        if first.at not in (first.centres[0], first.centres[-1]):
+            return (
+                f"{what} acts along or against the motion by where it is, either way, most at {where}: something rubs "
+                "or is lubricated there"
+            )
+    return ""
 
 
 @dataclass(frozen=True)
@@ -193,17 +209,19 @@ def _oscillation(signal: str, residuals: Sequence[Array], steps: Sequence[float]
                 for a, b in itertools.pairwise(edges)
             ),
             at=float(np.median([s.middle(tried[best]) for s in spectra])),
+            at_unit="Hz",
         )
     ]
 
 
 def _dependences(
-    residuals: Mapping[str, list[Array]], states: Mapping[str, list[Array]], signal: str
+    residuals: Mapping[str, list[Array]], states: Mapping[str, list[Array]], signal: str, unit: str = "rad"
 ) -> tuple[Dependence, ...]:
     """Shares of one signal's residual, largest first.
 
     residuals  signal -> per condition block (n, p) measured - model
     states     variable -> per condition block (n, p)
+    unit       of the position
     """
     r = np.concatenate([a.mean(axis=0) for a in residuals[signal]])
     out = []
@@ -219,28 +237,48 @@ def _dependences(
             values = np.concatenate([a.mean(axis=0) for a in states[variable]])
             target = r
         out.append(_dependence(variable, signal, values, target))
+    if "position" in states and "velocity" in states:
+        position, velocity = (
+            np.concatenate([a.mean(axis=0) for a in states[name]]) for name in ("position", "velocity")
+        )
+        braking = _dependence(BRAKING, signal, position, r - r.mean(), _direction(velocity))
+        if braking.curve:
+            most = braking.centres[int(np.argmax(np.abs(braking.curve)))]
+            braking = replace(braking, at=most, at_unit=unit)
+        out.append(braking)
     return tuple(sorted(out, key=lambda d: -d.share))
 
 
-def _dependence(variable: str, signal: str, x: Array, y: Array) -> Dependence:
+def _direction(velocity: Array) -> Array:
+    """1, -1, or 0 at rest."""
+    way: Array = np.sign(velocity) * (np.abs(velocity) > AT_REST * np.abs(velocity).max(initial=0.0))
+    return way
+
+
+def _dependence(variable: str, signal: str, x: Array, y: Array, direction: Array | float = 1.0) -> Dependence:
+    """Of a residual y (n,) against a variable x (n,); with a direction (n,) the curve is that of y against it."""
     if variable == "direction":
-        labels = np.sign(x) * (np.abs(x) > AT_REST * np.abs(x).max(initial=0.0))
+        labels = _direction(x)
         groups = np.unique(labels)
-        index = np.searchsorted(groups, labels)
+        index: NDArray[np.int64] = np.searchsorted(groups, labels)
     else:
-        edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, BINS + 1)))
+        bins = 2 * BINS if variable == BRAKING else BINS
+        edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, bins + 1)))
         if edges.size < 3:
             return Dependence(variable, signal, 0.0, (), ())
         index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, edges.size - 2)
-        groups = np.arange(edges.size - 1)
+        groups = np.arange(edges.size - 1, dtype=np.float64)
+    sign = np.broadcast_to(direction, y.shape)
     centres, curve, inside = [], [], 0.0
     for k in range(groups.size):
         own = index == k
+        moving = own & (sign != 0.0)
         if not own.any():
             continue
+        level = float((sign[moving] * y[moving]).mean()) if moving.any() else 0.0
         centres.append(float(x[own].mean()))
-        curve.append(float(y[own].mean()))
-        inside += float(((y[own] - y[own].mean()) ** 2).sum())
+        curve.append(level)
+        inside += float(((y[own] - sign[own] * level) ** 2).sum())
     total, level = float(((y - y.mean()) ** 2).sum()), float((y**2).sum())
     k, n = len(centres), y.size
     # Of an offset alone rounding is left.

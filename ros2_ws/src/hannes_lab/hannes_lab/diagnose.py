@@ -29,7 +29,7 @@ from .choose import (
     tied_sets,
 )
 from .delays import in_time
-from .depends import residual_dependences, swings
+from .depends import pointed_at, residual_dependences
 from .diagnosis import Diagnosis, Fall, FoundEffect, ParameterEstimate
 from .errors import SignalError
 from .executor import Executor
@@ -179,7 +179,7 @@ def diagnose(
         costs={"nominal_fitted": answer.null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
         nuisances=_nuisance_table(best.fit, intervals),
         notes=(
-            *filter(None, (swings(depends_on) if verdict == "unknown" else "",)),
+            *filter(None, (pointed_at(depends_on) if verdict == "unknown" else "",)),
             *prepared.notes,
             *choice.notes,
             *((choice.left,) if choice.left and verdict != "unknown" else ()),

@@ -56,7 +56,7 @@ LONG_NOTE, NOTE = 260, 150
 
 PACKAGES = ("hannes_lab", "hannes_sim", "mujoco", "numba", "numpy", "scipy")
 
-VARIABLE_UNITS = {"position": "rad", "velocity": "rad/s", "frequency": "Hz"}
+VARIABLE_UNITS = {"position": "rad", "friction_by_position": "rad", "velocity": "rad/s", "frequency": "Hz"}
 """Unit of each variable; `load` has that of the signal, the others have none."""
 
 
@@ -542,7 +542,7 @@ def dependences(comparison: Part | None, after: Part | None, diagnosis: Part | N
         ys = [v for _, _, y in curves for v in y if v is not None]
         steps = name == "direction"
         at = text.known(sources[-1][1].get("at"))
-        where = "" if at is None else f", at {text.number(at, 2)} Hz"
+        where = "" if at is None else f", {text.number(at, 2)} {text.unit(sources[-1][1].get('at_unit', ''))}"
         unit = signal_unit if name == "load" else VARIABLE_UNITS.get(name, "")
         rows.append(
             {
@@ -567,7 +567,7 @@ def dependences(comparison: Part | None, after: Part | None, diagnosis: Part | N
         "rows": rows,
         "signal": rows[0]["signal"],
         "kinds": [k for k, s in (("before", before), ("after", later)) if s],
-        "strongest": [(r["name"] + r["where"], r["shares"][key]) for r in strongest],
+        "strongest": [(text.words(r["name"]) + r["where"], r["shares"][key]) for r in strongest],
     }
 
 

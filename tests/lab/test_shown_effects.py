@@ -1,4 +1,4 @@
-"""An effect of one's own that the project shows: a load on an elastic shaft, and how a diagnosis leads to it."""
+"""Effects of one's own that the project shows (`examples/effects`), and how a diagnosis leads to them."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.rig import load_rig
-from lab.single_mass_rig import Law, write_files
+from hannes_sim.effect import load_effect
+from hannes_sim.factory import make_plant
+from hannes_sim.rollout import rollout
+from lab.single_mass_rig import Law, reference, write_files
 
 ADAPTER = f"{Path(__file__).parent / 'single_mass_rig.py'}:SingleMass"
-SHOWN = Path(__file__).parents[2] / "examples" / "effects" / "elastic_load.py"
+SHOWN = Path(__file__).parents[2] / "examples" / "effects"
 WHOLE, PART, HERTZ, DAMPING = 2.1, 0.7, 6.0, 0.04
 
 
 def quick(laps: int = 6) -> np.ndarray:
-    """Ramps of 0.1 m in 0.2 s there and in 0.5 s back, with stands of 1 s."""
-    there, back = np.linspace(0.0, 0.1, 200), np.linspace(0.1, 0.0, 500)
-    lap = np.concatenate([there, np.full(1000, 0.1), back, np.zeros(1000)])
+    """Ramps of 0.1 m in 0.2 s and 0.05 m in 0.3 s there, and in 0.5 and 0.4 s back, with stands of 1 s."""
+    ways = [(0.0, 0.1, 200), (0.1, 0.0, 500), (0.0, 0.05, 300), (0.05, 0.0, 400)]
+    lap = np.concatenate([np.append(np.linspace(a, b, n), np.full(1000, b)) for a, b, n in ways])
     return np.concatenate([np.zeros(1000), *[lap] * laps])
 
 
@@ -69,7 +72,7 @@ def test_what_swings_is_unknown_and_its_frequency_is_said(prepared: Prepared) ->
 
 def test_with_the_effect_that_is_shown_it_is_found(prepared: Prepared, tmp_path: Path) -> None:
     mine = tmp_path / "elastic.py"
-    text = SHOWN.read_text().replace("INERTIA = 0.04\n", "INERTIA = 0.5\n")
+    text = (SHOWN / "elastic_load.py").read_text().replace("INERTIA = 0.04\n", "INERTIA = 0.5\n")
     mine.write_text(text.replace("FREQUENCY = 6.0\n", "FREQUENCY = 7.0\n"))
     source = f"{mine}:ElasticLoad"
     found = diagnose(prepared, effect_sources(only=["coulomb_friction", source], model=prepared.model))
@@ -79,3 +82,30 @@ def test_with_the_effect_that_is_shown_it_is_found(prepared: Prepared, tmp_path:
         p = effect.parameters[name]
         assert p.low <= true <= p.high or p.value == pytest.approx(true, rel=0.03), name
     assert found.falls[-1].held_out < 0.05 * found.falls[1].held_out
+
+
+def test_what_rubs_at_a_place_is_said_to_and_found(tmp_path: Path) -> None:
+    """Of 3 N at 40 mm of the way, both ways; the machine has no other dry friction."""
+    write_files(tmp_path)
+    rig, model = load_rig(ADAPTER), Model.load(tmp_path / "mass.yaml")
+    mine = tmp_path / "rubs.py"
+    text = (SHOWN / "local_friction.py").read_text()
+    mine.write_text(text.replace("WIDTH = 10.0, 0.38, 0.05\n", "WIDTH = 2.0, 0.05, 0.01\n"))
+    source = f"{mine}:LocalFriction"
+    rubs = load_effect(source).entry({"level": 3.0, "place": 0.04, "width": 0.008}, source=source)
+    run = rollout(make_plant(model.with_effect(rubs)), rig([]).controller(model, 1e-3), reference(5))
+    rng = np.random.default_rng(2)
+    position = run.encoder_position + 2e-6 * rng.standard_normal(run.time.size)
+    force = run.motor_voltage + 0.05 * rng.standard_normal(run.time.size)
+    np.savez(tmp_path / "mass.npz", reference=run.reference_position, position=position, force=force)
+    prepared = prepare(rig.read([tmp_path / "mass.npz"]), model, rig=rig)
+    only = ["cogging", "stribeck_friction", "direction_dependent_friction"]
+    found = diagnose(prepared, effect_sources(only=only, model=prepared.model))
+    assert found.verdict == "unknown"
+    first = found.depends_on[0]
+    assert first.variable == "friction_by_position" and first.at == pytest.approx(0.04, abs=0.005)
+    assert "something rubs" in found.notes[0]
+    found = diagnose(prepared, effect_sources(only=["stribeck_friction", source], model=prepared.model))
+    (effect,) = found.effects
+    for name, true in (("level", 3.0), ("place", 0.04), ("width", 0.008)):
+        assert effect.parameters[name].value == pytest.approx(true, rel=0.03), name
