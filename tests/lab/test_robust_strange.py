@@ -176,7 +176,11 @@ def test_compare_fits_a_strange_hand_as_a_diagnosis_does(tmp_path: Path) -> None
     null = Search(prepared.problem, prepared.model, prepared.nuisances, {}).null().fit
     expected = prepared.features.closures(prepared.rig, prepared.model, null.values)
     assert fitted.overall == overall(signal_errors(prepared.features, expected))
-    assert fitted.overall < compare(prepared).overall
+    plain = compare(prepared)
+    assert fitted.overall < plain.overall
+    said = "the recordings do not tell control.kp, control.damping"
+    assert any(note.startswith(said) and "--fitted" in note for note in plain.notes)
+    assert not any(note.startswith(said) for note in fitted.notes)
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from .features import Block, Features, data_used
 from .phases import METRICS, PHASES, metrics, phase_of
 from .prepare import FEW, Prepared
 from .search import Progress, Search, silent
-from .wording import held_notes, moved_notes, other_clock
+from .wording import held_notes, moved_notes, other_clock, untold
 
 Array = NDArray[np.float64]
 
@@ -174,7 +174,9 @@ def compare(
     own: list[str] = []
     if values is None:
         values = {}
-        if fitted:
+        if not fitted:
+            own = untold(prepared.nuisances)
+        else:
             search = Search(
                 prepared.problem,
                 model,

@@ -425,6 +425,16 @@ def _held_at(found: Fit, c: Coordinate, z: float) -> str:
     )
 
 
+def untold(nuisances: Sequence[Nuisance]) -> list[str]:
+    """What the recordings do not say of the machine, and of each of them, where nothing was fitted."""
+    wide = sorted((n.name for n in nuisances if nuisance_coordinate(n).wide), key=lambda name: "@" in name)
+    names = list(dict.fromkeys(name.partition("@")[0] for name in wide))
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return [
+        f"the recordings do not tell {', '.join(names[:NAMED])}{more}: here they are nominal, --fitted fits them"
+    ] * bool(names)
+
+
 def _undescribed(best: Candidate) -> list[str]:
     """What the recordings do not say of the machine as a whole, and of each recording, as it was fitted."""
     fitted: dict[str, list[str]] = {"": []}

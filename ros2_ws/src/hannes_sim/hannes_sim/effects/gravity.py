@@ -22,8 +22,8 @@ class Gravity(Effect):
     name = "gravity"
     title = "gravity and hand pose"
     parameters = (
-        EffectParameter("cosine", "N.m", -0.05, 0.05, 0.005, 0.0, "torque g_c at the open hand"),
-        EffectParameter("sine", "N.m", -0.05, 0.05, 0.0, 0.0, "torque g_s at fingers bent by 90 degrees"),
+        EffectParameter("cosine", "N.m", -0.05, 0.05, 0.005, 0.0, "torque g_c at position 0 (the open hand)"),
+        EffectParameter("sine", "N.m", -0.05, 0.05, 0.0, 0.0, "torque g_s where it has turned by 90 degrees"),
     )
     known = (
         EffectParameter(
