@@ -23,7 +23,7 @@ BINS = 10
 BAND = 1.15
 """A frequency is a band from so many times lower to so many times higher."""
 
-CYCLES = 4.0
+CYCLES = 2.0
 """Least number of cycles in the shortest closure: what is slower is no oscillation, but its form."""
 
 OTHER_SPEED = 1.25
