@@ -9,7 +9,7 @@ from ..ports import DELAY
 class CommandDelay(Effect):
     """Dead time between the controller's output and the motor's voltage.
 
-    Equation: u_motor(t) = u(t - t_d).
+    Equation: u_motor(t) = u(t - t_d), between two steps of the plant by a straight line.
     Limits: constant; jitter and lost messages are not modelled; at most 511 steps of the plant.
     """
 
