@@ -18,7 +18,7 @@ from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Fall
 from hannes_lab.falls import error_falls
 from hannes_lab.features import compact_end
-from hannes_lab.fit import Fit, fit
+from hannes_lab.fit import Fit, Forces, finite_differences, fit, prior_weights
 from hannes_lab.greedy import _left_open
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import effect_coordinates
@@ -157,6 +157,47 @@ def test_laps_that_begin_a_part_of_a_period_later_are_no_copies_of_one_another(
     assert error() > 3.0, "these laps show nothing"
 
 
+def test_a_factor_on_all_forces_is_told_by_the_tolerances_alone(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A force constant beside mass and friction: what drives them is known in the constant's units only."""
+    (tmp_path / "tolerances.yaml").write_text(
+        "motor.kt: {sd: 0.02, closure_sd: 0.0, unit: '1', source: test}\n"
+        "motor.armature: {sd: 0.1, closure_sd: 0.0, unit: '1', source: test}\n"
+        "friction.viscous: {sd: 0.4, closure_sd: 0.0, unit: '1', source: test}\n"
+    )
+    rig, model = load_rig(ADAPTER), Model.load(recording.parent / "mass.yaml")
+    trials = rig.read([recording])
+    monkeypatch.setattr(rig, "population", tmp_path / "tolerances.yaml")
+    prepared = prepare(trials, model, rig=rig)
+    sources = effect_sources(only=["coulomb_friction", "cogging"], model=model)
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, sources)
+    found = search.polish(search.fitted(["coulomb_friction"]))
+    priors = prior_weights(found.fit.coordinates)
+    forces = Forces(found.fit.coordinates, found.fit.z)
+    names = [c.name for c in found.fit.coordinates]
+    assert {names[j] for j in forces.powers} == {
+        *("motor.kt", "motor.armature", "friction.viscous", "coulomb_friction.level")
+    }
+    best = forces.likeliest(priors)
+    assert (
+        float((priors * found.fit.z) @ (priors * found.fit.z))
+        <= float((priors * best) @ (priors * best)) + 0.2
+    ), "the priors would like another factor better"
+    wide = search.with_spread(found).fit
+    # Mass, friction and constant have 10, 40 and 2 %: together they know the factor to 1.96 %.
+    half = 1.96 * wide.sd()[names.index("motor.kt")]
+    assert half == pytest.approx(1.96, rel=0.05)
+    blurred = replace(
+        wide,
+        jacobian=finite_differences(
+            search.problem, wide.model, wide.coordinates, wide.z, wide.residual, range(len(names)), {}
+        ),
+    )
+    assert np.abs(wide.jacobian @ forces.direction()).max() < 1e-6 * np.abs(wide.jacobian).max()
+    assert np.abs(blurred.jacobian @ forces.direction()).max() > 0.0
+
+
 def test_what_is_no_shift_in_time_is_left_where_it_is() -> None:
     time = np.arange(8000) * 1e-3
     ever_more = 1.0 + 0.01 * np.floor(time / 2.0)
@@ -213,8 +254,14 @@ def test_what_only_scales_with_all_else_is_led_back_to_its_tolerance(prepared: P
     problem = search.problem
     near = search.fitted(names).fit
     factor = {c.name: 1.0 if c.name.endswith("period") else 1.4 for c in near.coordinates}
-    scaled = {c.name: c.z(factor[c.name] * near.values[c.name]) for c in near.coordinates}
-    away = fit(problem, near.model, near.coordinates, scaled, evaluations=1)
+    z = np.array([c.z(factor[c.name] * near.values[c.name]) for c in near.coordinates])
+    priors = prior_weights(near.coordinates)
+    values = {c.name: c.value(float(v)) for c, v in zip(near.coordinates, z, strict=True)}
+    residual = problem.residual(near.model, values)
+    cost = float(residual @ residual + (priors * z) @ (priors * z))
+    away = replace(near, z=z, residual=residual, cost=cost)
+    at_once = fit(problem, near.model, near.coordinates, z, evaluations=1)
+    assert abs(at_once.z_of("motor.kt") or 0.0) < 2.0 and at_once.cost < cost - 100.0
     assert away.z_of("motor.kt") > 10.0 and away.misfit == pytest.approx(near.misfit, rel=0.01)
     back = search.polish(Candidate(names, away, away.cost)).fit
     assert abs(back.z_of("motor.kt")) < 1.0 and back.cost < away.cost - 100.0

@@ -56,10 +56,14 @@ def linear_unit(unit: str) -> str:
     return unit
 
 
+def in_volts(parameters: Container[str]) -> bool:
+    """Whether the command of a drive of these parameters is a voltage, against resistance and back-EMF."""
+    return "motor.resistance" in parameters and "motor.emf_compensated" not in parameters
+
+
 def any_unit(unit: str, parameters: Container[str]) -> bool:
     """Whether a drive of these parameters may give such a quantity in whatever its command is in.
 
     Without a resistance or a back-EMF the command may be a current or a torque, and nothing is in volts or amperes.
     """
-    volts = "motor.resistance" in parameters and "motor.emf_compensated" not in parameters
-    return not volts and any(token in ("V", "A", "ohm") for token, _ in tokens(unit))
+    return not in_volts(parameters) and any(token in ("V", "A", "ohm") for token, _ in tokens(unit))

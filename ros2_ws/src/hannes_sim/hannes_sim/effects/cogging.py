@@ -18,7 +18,8 @@ class Cogging(Effect):
     """A torque that is periodic in the motor side's angle.
 
     Equation: tau = A (sin x + s2 sin 2x + c2 cos 2x + s3 sin 3x + c3 cos 3x), of no mean, where A sin x =
-    a sin(2 pi q / P) + b cos(2 pi q / P), added to the motor's torque: any phase at the encoder's zero, and a wave that need not be a sine.
+    a sin(2 pi q / P) + b cos(2 pi q / P), added to the motor's torque: any phase at the encoder's zero, and a wave that
+    need not be a sine.
     Limits: three harmonics; with a sampling of the current below its frequency it is seen through the position only.
     """
 
