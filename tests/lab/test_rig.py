@@ -18,7 +18,8 @@ from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Fall
 from hannes_lab.falls import error_falls
 from hannes_lab.features import compact_end
-from hannes_lab.fit import Fit, Forces, finite_differences, fit, prior_weights
+from hannes_lab.fit import Fit, finite_differences, fit, prior_weights
+from hannes_lab.forces import Forces
 from hannes_lab.greedy import _left_open
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import effect_coordinates

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from hannes_description.model import Model
-from hannes_description.units import in_volts, tokens
+from hannes_description.units import in_volts
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from .forces import Forces
 from .problem import Coordinate, Problem
 
 Array = NDArray[np.float64]
@@ -226,61 +226,10 @@ UNSCALED = 0.1
 """Whitened change of a simulation by a factor on all forces up to which the data say nothing of that factor: a
 hundredth of what the priors do."""
 
-NEWTON = 4
-"""Steps to the factor on all forces that priors like best."""
-
-ALONG = 1e-3
-"""Step, of a logarithm, of a derivative of the priors along a factor on all forces."""
-
 UNSEEN = 1e-3
 """Where only a part of the features takes part in a fit: weight with which a strength or a shape without a prior is
 drawn to where it vanishes, or is typical.  Else what that part does not show of it would stay at the start, which may
 have been fitted to the rest."""
-
-
-FORCES = ("N.m", "N", "kg.m2", "kg")
-"""Units of what a machine's forces and masses are in, which all scale together."""
-
-
-class Forces:
-    """A factor on all forces and masses of a point z (k,).
-
-    Where the command is a current or a force, its constant, masses, frictions, weights and ripples are known by the
-    motion up to that factor: only priors tell it.  The derivatives, which the roughness of dry friction blurs, lead a
-    fit a little along this valley, tell it that there it ends, and make it look narrow.
-    """
-
-    def __init__(self, coordinates: Sequence[Coordinate], z: Array) -> None:
-        self.coordinates, self.z = coordinates, z
-        self.powers = {
-            j: power
-            for j, c in enumerate(coordinates)
-            if (power := sum(n for unit, n in tokens(c.unit) if unit in FORCES))
-        }
-
-    def scaled(self, sigma: float) -> Array:
-        """The point with all of them larger by the factor exp(sigma)."""
-        moved = self.z.copy()
-        for j, power in self.powers.items():
-            c = self.coordinates[j]
-            moved[j] = c.z(c.value(float(self.z[j])) * math.exp(power * sigma))
-        return moved
-
-    def direction(self, sigma: float = 0.0) -> Array:
-        """Derivative (k,) of the point by the factor's logarithm."""
-        away: Array = (self.scaled(sigma + ALONG) - self.scaled(sigma - ALONG)) / (2.0 * ALONG)
-        return away
-
-    def likeliest(self, priors: Array) -> Array:
-        """The point (k,) with the factor that priors of these weights (k,) like best (Newton's method)."""
-        sigma = 0.0
-        for _ in range(NEWTON):
-            slope = priors * self.direction(sigma)
-            curvature = float(slope @ slope)
-            if curvature == 0.0:
-                return self.z
-            sigma -= float(slope @ (priors * self.scaled(sigma))) / curvature
-        return self.scaled(sigma)
 
 
 def without_scale(problem: Problem, found: Fit) -> Fit:
