@@ -130,12 +130,12 @@ def pointed_at(found: Sequence[Dependence]) -> str:
         if first.variable == FREQUENCY:
             return (
                 f"{what} oscillates at {where} in all conditions, at whatever speed: something swings that the model "
-                "takes for rigid (a shaft, a belt, a mount, what hangs)"
+                "takes for rigid (a shaft, a belt, a mount, what hangs); examples/effects/elastic_load.py is an effect for it"
             )
         if first.at not in (first.centres[0], first.centres[-1]):
             return (
                 f"{what} acts along or against the motion by where it is, either way, most at {where}: something rubs "
-                "or is lubricated there"
+                "or is lubricated there; examples/effects/local_friction.py is an effect for it"
             )
     return ""
 
