@@ -130,7 +130,8 @@ def pointed_at(found: Sequence[Dependence]) -> str:
         if first.variable == FREQUENCY:
             return (
                 f"{what} oscillates at {where} in all conditions, at whatever speed: something swings that the model "
-                "takes for rigid (a shaft, a belt, a mount, what hangs); examples/effects/elastic_load.py is an effect for it"
+                "takes for rigid (a shaft, a belt, a mount, what hangs); examples/effects/elastic_load.py is an effect "
+                "for it"
             )
         if first.at not in (first.centres[0], first.centres[-1]):
             return (
