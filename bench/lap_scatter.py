@@ -2,7 +2,8 @@
 
 The mass of `tests/lab/single_mass_rig.py` with Coulomb friction and a ripple; dry and viscous friction differ by 8 %
 from lap to lap, and no tolerance speaks of it.  All parameters are fitted from the truth; printed is how many of the
-95 % intervals hold it, from the curvature alone and as wide as the laps' own scatter makes them (`hannes_lab.intervals`).
+95 % intervals hold it, from the curvature alone and as wide as the laps' own scatter makes them
+(`hannes_lab.intervals`).
 """
 
 from __future__ import annotations
