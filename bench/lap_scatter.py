@@ -20,15 +20,15 @@ from hannes_lab.fit import fit, over_its_spread
 from hannes_lab.intervals import NORMAL, sway
 from hannes_lab.prepare import prepare
 from hannes_lab.problem import effect_coordinates, nuisance_coordinate, vanishing_entry
-from hannes_lab.rig import load_rig, scaled_effect
+from hannes_lab.rig import load_rig
 from hannes_sim.effect import load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.rollout import rollout
 
-TESTS = Path(__file__).parents[1] / "tests"
-sys.path.insert(0, str(TESTS))
-from lab.single_mass_rig import reference, write_files  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from lab.single_mass_rig import reference, write_files
 
+ADAPTER = f"{Path(__file__).parents[1] / 'tests' / 'lab' / 'single_mass_rig.py'}:SingleMass"
 SCATTER, MOST_LAPS = 0.08, 8
 TRUTH = {
     "motor.armature": 2.1,
@@ -64,7 +64,7 @@ class Laps(Effect):
 
 def record(folder: Path, rig: Any, laps: int, seed: int) -> None:
     """One recording of the mass whose friction scatters, with noise of 5 um and 0.06 N."""
-    rng, sizes = np.random.default_rng(seed), tuple(sorted(rig.sizes.items()))
+    rng, machine = np.random.default_rng(seed), rig([])
     write_files(folder)
     (folder / "laps.py").write_text(LAPS)
     model = Model.load(folder / "mass.yaml").with_values(
@@ -72,15 +72,14 @@ def record(folder: Path, rig: Any, laps: int, seed: int) -> None:
     )
     for name in ("coulomb_friction", "cogging"):
         own = {k.partition(".")[2]: v for k, v in TRUTH.items() if k.startswith(name)}
-        kind = scaled_effect(load_effect(name), sizes, True)  # type: ignore[arg-type]  # a class is hashable
-        model = model.with_effect(kind.entry(own))
+        model = model.with_effect(machine.effect(load_effect(name)).entry(own))
     source = f"{folder / 'laps.py'}:Laps"
     scattered = {"lap": reference(1).size * 1e-3}
     for k in range(MOST_LAPS):
         scattered[f"dry{k}"] = SCATTER * TRUTH["coulomb_friction.level"] * rng.standard_normal()
         scattered[f"viscous{k}"] = SCATTER * TRUTH["friction.viscous"] * rng.standard_normal()
     model = model.with_effect(load_effect(source).entry(scattered, source=source))
-    run = rollout(make_plant(model), rig([]).controller(model, 1e-3), reference(laps))
+    run = rollout(make_plant(model), machine.controller(model, 1e-3), reference(laps))
     np.savez(
         folder / "mass.npz",
         reference=run.reference_position,
@@ -91,7 +90,7 @@ def record(folder: Path, rig: Any, laps: int, seed: int) -> None:
 
 def held(laps: int, pooled: bool, seed: int) -> dict[str, tuple[bool, bool]]:
     """Per parameter whether its interval holds the truth: by the curvature, and by the laps' scatter."""
-    rig = load_rig(f"{TESTS / 'lab' / 'single_mass_rig.py'}:SingleMass")
+    rig = load_rig(ADAPTER)
     rig.pooled = pooled
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -39,7 +39,7 @@ ROUNDING = 1e-12
 """Part of a residual's square below which it does not vary."""
 
 WORTH_SAYING = 0.2
-"""Share of a frequency from which it is said in words."""
+"""Share of a frequency, or of friction by position, from which it is said in words."""
 
 ABOVE = 2.0
 """Times that a mean residual's square must exceed what the closures' scatter makes of it, to show a frequency."""
@@ -110,8 +110,8 @@ def residual_dependences(
                 states[name].append(np.tile(values, (target.n, 1)))
     # Of a set in which the encoder is not logged everywhere, what depends on it is not known.
     known = {name: values for name, values in states.items() if len(values) == len(places)}
-    steps = [float(by[place[0], place[1], signal][0].phase[1]) for place in places]
-    steps = [s - float(by[p[0], p[1], signal][0].phase[0]) for s, p in zip(steps, places, strict=True)]
+    phases = [b.phase for b in features.blocks if b.signal == signal]
+    steps = [float(phase[1] - phase[0]) for phase in phases]
     unit = next((b.unit for b in features.blocks if b.signal == "encoder_position"), "")
     found = [*_dependences(residuals, known, signal, unit), *_oscillation(signal, residuals[signal], steps)]
     return tuple(sorted(found, key=lambda d: -d.share))
@@ -218,7 +218,7 @@ def _oscillation(signal: str, residuals: Sequence[Array], steps: Sequence[float]
 def _dependences(
     residuals: Mapping[str, list[Array]], states: Mapping[str, list[Array]], signal: str, unit: str = "rad"
 ) -> tuple[Dependence, ...]:
-    """Shares of one signal's residual, largest first.
+    """Shares of one signal's residual, by variable.
 
     residuals  signal -> per condition block (n, p) measured - model
     states     variable -> per condition block (n, p)
@@ -247,7 +247,7 @@ def _dependences(
             most = braking.centres[int(np.argmax(np.abs(braking.curve)))]
             braking = replace(braking, at=most, at_unit=unit)
         out.append(braking)
-    return tuple(sorted(out, key=lambda d: -d.share))
+    return tuple(out)
 
 
 def _direction(velocity: Array) -> Array:
@@ -276,10 +276,10 @@ def _dependence(variable: str, signal: str, x: Array, y: Array, direction: Array
         moving = own & (sign != 0.0)
         if not own.any():
             continue
-        level = float((sign[moving] * y[moving]).mean()) if moving.any() else 0.0
+        height = float((sign[moving] * y[moving]).mean()) if moving.any() else 0.0
         centres.append(float(x[own].mean()))
-        curve.append(level)
-        inside += float(((y[own] - sign[own] * level) ** 2).sum())
+        curve.append(height)
+        inside += float(((y[own] - sign[own] * height) ** 2).sum())
     total, level = float(((y - y.mean()) ** 2).sum()), float((y**2).sum())
     k, n = len(centres), y.size
     # Of an offset alone rounding is left.

@@ -149,6 +149,7 @@ def diagnose(
         prepared.features.closures(prepared.rig, best.fit.model, best.fit.values),
         prepared.rig.drive_signals,
     )
+    pointer = pointed_at(depends_on) if verdict == "unknown" else ""
     experiments = (
         separating_experiments(prepared, search, [search.fit_of(n) for n in tied]) if len(tied) > 1 else ()
     )
@@ -179,7 +180,7 @@ def diagnose(
         costs={"nominal_fitted": answer.null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
         nuisances=_nuisance_table(best.fit, intervals),
         notes=(
-            *filter(None, (pointed_at(depends_on) if verdict == "unknown" else "",)),
+            *((pointer,) if pointer else ()),
             *prepared.notes,
             *choice.notes,
             *((choice.left,) if choice.left and verdict != "unknown" else ()),

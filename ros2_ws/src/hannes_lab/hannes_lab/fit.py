@@ -237,10 +237,12 @@ def without_scale(problem: Problem, found: Fit) -> Fit:
 
     By so much as the priors leave it open, it may change next to nothing.
     """
+    if in_volts(found.model.parameters):
+        return found
     forces = Forces(found.coordinates, found.z)
     along = forces.direction()
     slope = prior_weights(found.coordinates) * along
-    if in_volts(found.model.parameters) or not slope.any():
+    if not slope.any():
         return found
     moved = forces.scaled(1.0 / float(np.linalg.norm(slope)))
     values = {c.name: c.value(float(z)) for c, z in zip(found.coordinates, moved, strict=True)}
@@ -435,16 +437,13 @@ def fit(
     except _NotWorth:
         z, complete = derivatives.z, False
     r = residual_at(z)
-    other = np.clip(Forces(coordinates, z).likeliest(priors), bounds[0] + edge, bounds[1] - edge)
-    # Only where the priors alone would gain by it is it worth a simulation; a back-EMF tells the factor.
-    if (
-        complete
-        and not in_volts(model.parameters)
-        and ((priors * z) @ (priors * z) - (priors * other) @ (priors * other)) > LEAST_GAIN
-    ):
-        there = residual_at(other)
-        if cost(there, other) < cost(r, z):
-            z, r = other, there
+    if complete and not in_volts(model.parameters):  # a back-EMF tells the factor
+        other = np.clip(Forces(coordinates, z).likeliest(priors), bounds[0] + edge, bounds[1] - edge)
+        # Only where the priors alone would gain by it is it worth a simulation.
+        if (priors * z) @ (priors * z) - (priors * other) @ (priors * other) > LEAST_GAIN:
+            there = residual_at(other)
+            if cost(there, other) < cost(r, z):
+                z, r = other, there
     if exact and not derivatives.fresh:
         derivatives.forget()
     jacobian = derivatives.at(z, r)
