@@ -103,6 +103,7 @@ def make_comparison(*, off: float = 0.3, condition: str = "slow", closures: int 
         "depends_on": {
             "load": {
                 "variable": "load",
+                "unit": "mm",
                 "signal": "encoder_position",
                 "share": 0.52,
                 "centres": [0.1, 0.2, 0.9],
@@ -366,6 +367,7 @@ def test_what_the_page_shows_of_an_effect() -> None:
         "−4.4 %",
         "3 of 3 beyond chance",
         "0 of 3 beyond chance",
+        "0.10 0.90 mm",
     ):
         assert part in page.words.replace("\u00a0", " "), part
     for target in [a["href"] for t, a in page.elements if t == "a"]:

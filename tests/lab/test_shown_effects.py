@@ -104,6 +104,15 @@ def test_what_rubs_at_a_place_is_said_to_and_found(tmp_path: Path) -> None:
     assert found.verdict == "unknown"
     first = found.depends_on[0]
     assert first.variable == "friction_by_position" and first.at == pytest.approx(0.04, abs=0.005)
+    assert {d.variable: d.unit for d in found.depends_on} == {
+        "position": "m",
+        "velocity": "m/s",
+        "direction": "",
+        "load": "N",
+        "time": "",
+        "friction_by_position": "m",
+        "frequency": "Hz",
+    }
     assert "something rubs" in found.notes[0]
     found = diagnose(prepared, effect_sources(only=["stribeck_friction", source], model=prepared.model))
     (effect,) = found.effects

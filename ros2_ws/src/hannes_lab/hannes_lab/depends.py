@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,9 @@ class Dependence:
 
     share    part of the variance of the closures' mean residual that the curve explains (adjusted R2), 0..1; an offset
              that is the same everywhere depends on nothing
-    centres  (b,) of the variable; curve (b,) mean residual, in the signal's unit; of a frequency amplitudes
-    at       where it oscillates in all conditions [Hz], or where what acts against the motion is largest; in `at_unit`
+    centres  (b,) of the variable, in `unit`; curve (b,) mean residual, in the signal's unit; of a frequency amplitudes
+    unit     of the variable; of time and direction none
+    at       where it oscillates in all conditions, or where what acts against the motion is largest; in `unit`
     """
 
     variable: str
@@ -62,19 +64,20 @@ class Dependence:
     share: float
     centres: tuple[float, ...]
     curve: tuple[float, ...]
+    unit: str = ""
     at: float | None = None
-    at_unit: str = ""
 
     @property
     def said(self) -> str:
         """The variable and its share, in words."""
-        where = "" if self.at is None or self.share == 0.0 else f" ({self.at:.2g} {self.at_unit})"
+        where = "" if self.at is None or self.share == 0.0 else f" ({self.at:.2g} {self.unit})"
         return f"{self.variable.replace('_', ' ')}{where} {100 * self.share:.0f} %"
 
     def to_dict(self) -> dict[str, Any]:
-        where = {} if self.at is None else {"at": self.at, "at_unit": self.at_unit}
+        where = {} if self.at is None else {"at": self.at}
         return where | {
             "variable": self.variable,
+            "unit": self.unit,
             "signal": self.signal,
             "share": self.share,
             "centres": list(self.centres),
@@ -112,8 +115,11 @@ def residual_dependences(
     known = {name: values for name, values in states.items() if len(values) == len(places)}
     phases = [b.phase for b in features.blocks if b.signal == signal]
     steps = [float(phase[1] - phase[0]) for phase in phases]
-    unit = next((b.unit for b in features.blocks if b.signal == "encoder_position"), "")
-    found = [*_dependences(residuals, known, signal, unit), *_oscillation(signal, residuals[signal], steps)]
+    of_signal = {b.signal: b.unit for b in features.blocks}
+    place_unit = of_signal.get("encoder_position", "")
+    speed_unit = f"{place_unit}/s" if place_unit else ""
+    units = {"position": place_unit, BRAKING: place_unit, "velocity": speed_unit, "load": of_signal[signal]}
+    found = [*_dependences(residuals, known, signal, units), *_oscillation(signal, residuals[signal], steps)]
     return tuple(sorted(found, key=lambda d: -d.share))
 
 
@@ -126,7 +132,7 @@ def pointed_at(found: Sequence[Dependence]) -> str:
         if first.at is None or first.share < WORTH_SAYING:
             return ""
         what = f"{100 * first.share:.0f} % of what is left of {first.signal}"
-        where = f"{first.at:.2g} {first.at_unit}"
+        where = f"{first.at:.2g} {first.unit}"
         if first.variable == FREQUENCY:
             return (
                 f"{what} oscillates at {where} in all conditions, at whatever speed: something swings that the model "
@@ -209,20 +215,23 @@ def _oscillation(signal: str, residuals: Sequence[Array], steps: Sequence[float]
                 float(np.mean([np.sqrt(2.0 * s.share(a, b) * s.variance) for s in spectra]))
                 for a, b in itertools.pairwise(edges)
             ),
+            unit="Hz",
             at=float(np.median([s.middle(tried[best]) for s in spectra])),
-            at_unit="Hz",
         )
     ]
 
 
 def _dependences(
-    residuals: Mapping[str, list[Array]], states: Mapping[str, list[Array]], signal: str, unit: str = "rad"
+    residuals: Mapping[str, list[Array]],
+    states: Mapping[str, list[Array]],
+    signal: str,
+    units: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Dependence, ...]:
     """Shares of one signal's residual, by variable.
 
     residuals  signal -> per condition block (n, p) measured - model
     states     variable -> per condition block (n, p)
-    unit       of the position
+    units      of the variables
     """
     r = np.concatenate([a.mean(axis=0) for a in residuals[signal]])
     out = []
@@ -245,9 +254,9 @@ def _dependences(
         braking = _dependence(BRAKING, signal, position, r - r.mean(), _direction(velocity))
         if braking.curve:
             most = braking.centres[int(np.argmax(np.abs(braking.curve)))]
-            braking = replace(braking, at=most, at_unit=unit)
+            braking = replace(braking, at=most)
         out.append(braking)
-    return tuple(out)
+    return tuple(replace(found, unit=units.get(found.variable, "")) for found in out)
 
 
 def _direction(velocity: Array) -> Array:

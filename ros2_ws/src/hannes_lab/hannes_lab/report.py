@@ -56,9 +56,6 @@ LONG_NOTE, NOTE = 260, 150
 
 PACKAGES = ("hannes_lab", "hannes_sim", "mujoco", "numba", "numpy", "scipy")
 
-VARIABLE_UNITS = {"position": "rad", "friction_by_position": "rad", "velocity": "rad/s", "frequency": "Hz"}
-"""Unit of each variable; `load` has that of the signal, the others have none."""
-
 
 def write_report(
     path: str | Path,
@@ -542,8 +539,8 @@ def dependences(comparison: Part | None, after: Part | None, diagnosis: Part | N
         ys = [v for _, _, y in curves for v in y if v is not None]
         steps = name == "direction"
         at = text.known(sources[-1][1].get("at"))
-        where = "" if at is None else f", {text.number(at, 2)} {text.unit(sources[-1][1].get('at_unit', ''))}"
-        unit = signal_unit if name == "load" else VARIABLE_UNITS.get(name, "")
+        unit = str(sources[-1][1].get("unit", ""))
+        where = "" if at is None else f", {text.number(at, 2)} {text.unit(unit)}"
         rows.append(
             {
                 "name": name,
