@@ -5,14 +5,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hannes_bags.recording import Channel, Recording
+from hannes_control.reference import half_sine
 from hannes_description.model import Model
+from hannes_description.signals import SIGNALS
 from hannes_lab.compare import compare
 from hannes_lab.depends import _dependences, _oscillation, pointed_at, residual_dependences
 from hannes_lab.features import Features
+from hannes_lab.hand import make_controller
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import strength_of
+from hannes_sim.factory import make_plant
+from hannes_sim.measurement import SENSORS
+from hannes_sim.objects import named_object
+from hannes_sim.rollout import rollout
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +46,33 @@ def test_there_is_contact_where_the_dynamometer_shows_more_than_it_does_at_rest(
     (shown,) = (o for o in found.overlays if o.signal == "encoder_position")
     touched = np.asarray(shown.measured)[np.asarray(shown.phase) == "grasp"]
     assert not presses or touched.min() == pytest.approx(8.6, abs=0.7)
+
+
+@pytest.mark.parametrize("periods", [(4.0, 4.0, 4.0, 2.0, 2.0, 2.0), (4.0, 2.0, 4.0, 2.0, 4.0, 2.0)])
+def test_each_condition_of_a_recording_grasps_where_its_own_closures_do(periods: tuple[float, ...]) -> None:
+    """Without a dynamometer the model tells when there is contact: in conditions one after the other, or in turn."""
+    model, rng = Model.load(), np.random.default_rng(7)
+    controller, sensors = make_controller(model, 1e-3), SENSORS["bench"]
+    closures = [half_sine(1, 13.0, period, controller.period) for period in periods]
+    reference = np.concatenate([np.zeros(500), *closures])
+    run = rollout(make_plant(model, named_object("rigid")), controller, reference, joints=False)
+    channels = {
+        name: Channel(time, values, SIGNALS[name].unit, name)
+        for name, (time, values) in sensors.sample(run, rng).items()
+        if name != "grip_force"
+    }
+    described = {"object": "rigid", "sensors": sensors.to_dict()}
+    found = compare(prepare([make_trial(Recording(channels, described, "rigid"))], model))
+    shown = [o for o in found.overlays if o.signal == "encoder_position"]
+    assert len(shown) == 2
+    begins = 0.5 + np.cumsum((0.0, *periods[:-1]))
+    for overlay, period in zip(shown, (4.0, 2.0), strict=True):
+        begin = begins[[k for k, p in enumerate(periods) if p == period][1]]
+        closing = (run.time > begin) & (run.time < begin + 0.5 * period)
+        touches = run.time[closing & (run.grip_force > 0.05 * run.grip_force.max())][0] - begin
+        phases = np.array(overlay.phase)
+        grasps = np.asarray(overlay.time)[phases == "grasp"]
+        assert grasps[0] == pytest.approx(touches, abs=0.08)
 
 
 def test_without_position_current_and_force_there_are_no_figures_of_the_thesis() -> None:

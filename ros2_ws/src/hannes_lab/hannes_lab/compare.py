@@ -236,8 +236,7 @@ def _contact(prepared: Prepared, values: Mapping[str, float]) -> dict[int, tuple
         if "grip_force" in trial.signals:
             time, force = trial.signals["grip_force"]
         else:
-            end = round(trial.closures[min(1, len(trial.closures) - 1)].stop / trial.period) + 1
-            run = prepared.rig.simulate(prepared.model, values, trial, trial.reference[:end])
+            run, _ = prepared.features.simulated(prepared.rig, prepared.model, values, k)
             if "grip_force" not in run:
                 out[k] = None
                 continue

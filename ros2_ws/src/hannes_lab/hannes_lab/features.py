@@ -2,9 +2,10 @@
 
 A feature vector is linear in the signals, and the same for measurement and simulation: each closure is sampled at the
 measured instants, interpolated onto a phase grid, and combined over the closures.  The simulation of a model without
-memory repeats itself from the second closure of a condition on, so only two closures are simulated and the rest is
-taken from the second.  Recordings that each begin anew repeat the first of them.  Where the references of the closures
-differ a little (an operator's amplitude), so do the closures: by how much is taken from one whole simulation.
+memory repeats itself from the second closure of a condition on, so it ends with the second of each and the rest is
+taken from that; where the second does not end as the first did, a rig simulates more (`PlantRig`).  Recordings that
+each begin anew repeat the first of them.  Where the references of the closures differ a little (an operator's
+amplitude), so do the closures: by how much is taken from one whole simulation.
 """
 
 from __future__ import annotations
@@ -62,7 +63,8 @@ class Block:
 
     phase      (p,) s since the closure's start
     measured   (n, p) the closures on the phase grid
-    before, after, weight   (n, p) samples [ticks of the simulation] and interpolation weight of each point
+    full       three arrays (n, p): of each point the ticks of the simulation before and after it, and the weight of the
+               one after
     compact    the same three for a simulation of the closures only that others repeat; None where that does not hold
     beside     (n, p) what closures differ by from those of a compact simulation, where they repeat each other nearly
     finest     of the signal's span: scatter that is assumed where closures are all the same
@@ -178,7 +180,7 @@ class Features:
         for number, (trial, end) in enumerate(zip(self.trials, self.ends, strict=True)):
             compact = end is not None and (trial.anew or not memory)
             compact &= number not in self.nearly or number in known
-            runs.append(self._simulated(rig, model, values, number, end if compact else None))
+            runs.append(self.simulated(rig, model, values, number, whole=not compact))
         out = [
             block.predicted(runs[block.trial][0][block.signal], runs[block.trial][1]) for block in self.blocks
         ]
@@ -190,11 +192,14 @@ class Features:
                 )
         return out
 
-    def _simulated(
-        self, rig: Rig, model: Model, values: Mapping[str, float], number: int, end: int | None
+    def simulated(
+        self, rig: Rig, model: Model, values: Mapping[str, float], number: int, *, whole: bool = False
     ) -> tuple[Mapping[str, Array], bool]:
-        """Signals of a trial up to a tick (None: all of it), and whether that is where they end."""
-        trial = self.trials[number]
+        """Signals of a trial, at the control ticks, and whether they end before the trial does.
+
+        They last as long as is needed for a closure of each condition that is not its first, or are whole.
+        """
+        trial, end = self.trials[number], None if whole else self.ends[number]
         if end is None and trial.anew:
             begins = [round(part.begin / trial.period) for part in trial.parts]
             references = np.split(trial.reference, begins[1:])
@@ -205,7 +210,8 @@ class Features:
             check_simulated(signals, self._wanted[number], trial, reference.size, rig)
         if len(runs) == 1:
             return runs[0], end is not None and not _whole(runs[0], trial)
-        return {name: np.concatenate([run[name] for run in runs]) for name in self._wanted[number]}, False
+        shared = set.intersection(*(set(run) for run in runs))
+        return {name: np.concatenate([run[name] for run in runs]) for name in shared}, False
 
     def compacted(self, rig: Rig, model: Model, values: Mapping[str, float]) -> Features:
         """The same, so that compact simulations will do where closures repeat each other nearly.
@@ -218,10 +224,10 @@ class Features:
         blocks = list(self.blocks)
         for number in self.nearly:
             try:
-                short, compact = self._simulated(rig, model, values, number, self.ends[number])
+                short, compact = self.simulated(rig, model, values, number)
                 if not compact:
                     continue
-                whole, _ = self._simulated(rig, model, values, number, None)
+                whole, _ = self.simulated(rig, model, values, number, whole=True)
             except PlantDiverged:
                 continue
             for k, block in enumerate(blocks):
