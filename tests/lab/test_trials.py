@@ -343,6 +343,16 @@ def test_names_of_trials_are_made_unique() -> None:
     trial = make_trial(recording(half_sine(3), 250.0, metadata={"condition": "slow"}))
     names = [t.name for t in unique_names([trial, trial])]
     assert names == ["slow", "slow#2"]
+    own = [replace(trial, name=name) for name in ("s", "s", "s#2", "s")]
+    assert [t.name for t in unique_names(own)] == ["s", "s#3", "s#2", "s#4"]
+    assert {t.conditions for t in unique_names(own)} == {("slow",)}, (
+        "a condition of a name of its own keeps it"
+    )
+    (closure, *_), named = trial.closures, []
+    for condition in ("s", "s.1", "slow"):
+        closures = (replace(closure, condition=condition),)
+        named.append(unique_names([replace(trial, name="s", closures=closures)] * 2)[1].conditions)
+    assert named == [("s#2",), ("s#2.1",), ("slow",)]
 
 
 def test_grouping_ignores_small_differences_only() -> None:

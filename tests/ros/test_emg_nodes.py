@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from graph import NodeProcess, processes
-from hannes_control.emg import EmgIntegrator, SyntheticEmg, emg_reference, synthesise
+from hannes_control.emg import EmgIntegrator, EmgParameters, SyntheticEmg, emg_reference, synthesise
 from hannes_ros import convert
 
 EMG = ("emg_flexor", "emg_extensor")
@@ -135,3 +135,27 @@ def test_reference_in_real_time_replaces_what_is_not_finite(peer):
     assert values(peer, "reference_position") == expected
     assert status["rejected_samples"] == "1"
     assert expected[-1] > 0.5
+
+
+def test_reference_in_real_time_catches_up_with_a_channel_that_came_late(peer):
+    """Samples of the other one that came before it would delay the hand for ever."""
+    peer.hear("reference_position")
+    peer.hear_diagnostics()
+    integrator = EmgIntegrator(EmgParameters(rate=100))
+    alone, paired, later = [1.0] * 80, [0.5] * 100, [0.8] * 30
+    with processes(NodeProcess("emg_reference", rate=100)):
+        for name in EMG:
+            peer.matched(name)
+        peer.until(lambda: bool(peer.status("emg_reference")), what="a report")
+        for sample in alone:
+            peer.say("emg_flexor", convert.float64_bytes(sample))
+        peer.spin(0.5)
+        for count, pairs in ((100, paired), (130, later)):
+            for sample in pairs:
+                peer.say("emg_flexor", convert.float64_bytes(sample))
+                peer.say("emg_extensor", convert.float64_bytes(0.0))
+            peer.until(lambda n=count: len(peer.heard["reference_position"]) == n, what="references")
+        status = peer.until_status("emg_reference", lambda s: s["samples"] == "130")
+    used = [*alone, *paired[:20], *later]
+    assert values(peer, "reference_position") == [integrator.update(sample, 0.0) for sample in used]
+    assert status["dropped_samples"] == "80"

@@ -84,9 +84,22 @@ def test_stepwise_equals_rollout(plant: Plant, model: Model) -> None:
     for k, wanted in enumerate(reference):
         reading = plant.read()
         assert reading.position == run.encoder_position[k] and reading.current == run.motor_current[k]
+        assert np.array_equal(reading.joint_positions, run.joint_positions[k])
+        assert np.array_equal(reading.joint_velocities, run.joint_velocities[k])
         voltage = law.update(float(wanted), reading.position, reading.current)
         assert voltage == run.motor_voltage[k]
         plant.advance(voltage, steps)
+
+
+def test_a_rollout_without_joints_says_so(plant: Plant, model: Model) -> None:
+    law, reference = DoublePID.of_model(model.parameters), half_sine(1, amplitude=8.0, period=0.6)
+    with_joints = rollout(plant, law, reference)
+    run = rollout(plant, law, reference, joints=False)
+    assert np.array_equal(run.encoder_position, with_joints.encoder_position)
+    assert with_joints.joint_positions.max() > 0.1
+    for name in ("joint_positions", "joint_velocities"):
+        with pytest.raises(HannesError, match="without the finger joints"):
+            run.signal(name)
 
 
 def test_object_stops_the_hand_and_feels_force(model: Model) -> None:

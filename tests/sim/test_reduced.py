@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hannes_control.double_pid import DoublePID
 from hannes_control.reference import half_sine
+from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_sim.factory import make_plant
 from hannes_sim.measurement import BENCH, THESIS, Sensors, folded_mean, logger
@@ -113,6 +114,11 @@ def test_sensors_rectify_average_and_sample() -> None:
     assert 0.002 < np.std(again["motor_current"][1] - thesis["motor_current"][1]) < 0.008
     with pytest.raises(ValueError, match="motor_rate"):
         Sensors(motor_rate=0.0)
+    for name, value in (("current_window", "0.03"), ("force_noise", None), ("motor_rate", True)):
+        with pytest.raises(HannesError, match=f"{name} is .*must be a number"):
+            Sensors.from_dict({name: value})
+    with pytest.raises(HannesError, match="current_rectified is 1; it must be true or false"):
+        Sensors.from_dict({"current_rectified": 1})
 
 
 def test_trailing_average_and_folded_noise() -> None:

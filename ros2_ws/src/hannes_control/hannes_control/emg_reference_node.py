@@ -99,6 +99,7 @@ class EmgReferenceNode(HannesNode, Node):
         )
         self._held = [0.0, 0.0]
         self._heard: dict[str, float] = {}
+        self._waiting = [_LONGEST_QUEUE, _LONGEST_QUEUE]
         self._taken = 0
         self._stamp = -1
         self._ticks: deque[int] = deque(maxlen=_LONGEST_QUEUE)
@@ -135,6 +136,7 @@ class EmgReferenceNode(HannesNode, Node):
             self._answer()
         elif all(self._channels):
             self._take()
+            self._catch_up()
             self._publish()
 
     def _take(self) -> None:
@@ -145,6 +147,17 @@ class EmgReferenceNode(HannesNode, Node):
         if self._emg.switches > self._switches:
             self._switches = self._emg.switches
             self.get_logger().info(f"co-contraction: switch event {self._switches}")
+
+    def _catch_up(self) -> None:
+        """Drop samples that have waited for the other channel all through a second: they came before it."""
+        self._waiting = [min(least, len(c)) for least, c in zip(self._waiting, self._channels, strict=True)]
+        if self._taken % self._p.rate:
+            return
+        for least, channel in zip(self._waiting, self._channels, strict=True):
+            for _ in range(least):
+                channel.popleft()
+            self._health.count("dropped_samples", least)
+        self._waiting = [_LONGEST_QUEUE, _LONGEST_QUEUE]
 
     def _publish(self) -> None:
         self._reference.publish(convert.float64_bytes(self._emg.reference))

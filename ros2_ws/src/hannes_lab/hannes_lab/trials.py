@@ -796,21 +796,25 @@ def stem_of(source: str) -> str:
 
 def unique_names(trials: Sequence[Trial], *, conditions: bool = True) -> list[Trial]:
     """Trials with names of their own, by which plants and parameters are kept; their conditions with them, if asked."""
-    taken: dict[str, int] = {}
+    given = {trial.name for trial in trials}
+    taken: set[str] = set()
     out = []
     for trial in trials:
-        count = taken.get(trial.name, 0)
-        taken[trial.name] = count + 1
-        if count:
-            new = f"{trial.name}#{count + 1}"
-            trial = replace(
-                trial,
-                name=new,
-                closures=tuple(
-                    replace(c, condition=c.condition.replace(trial.name, new, 1)) for c in trial.closures
+        name = trial.name
+        if name in taken:
+            name = next(new for k in itertools.count(2) if (new := f"{trial.name}#{k}") not in taken | given)
+            closures = trial.closures
+            if conditions:
+                closures = tuple(
+                    replace(c, condition=_renamed(c.condition, trial.name, name)) for c in closures
                 )
-                if conditions
-                else trial.closures,
-            )
+            trial = replace(trial, name=name, closures=closures)
+        taken.add(name)
         out.append(trial)
     return out
+
+
+def _renamed(condition: str, old: str, new: str) -> str:
+    """The name of a condition of a trial of a new name: it changes with it where it is the trial's, or begins so."""
+    named_after = condition == old or condition.startswith(f"{old}.")
+    return new + condition.removeprefix(old) if named_after else condition

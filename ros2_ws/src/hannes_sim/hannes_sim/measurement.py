@@ -49,7 +49,12 @@ class Sensors:
     def __post_init__(self) -> None:
         for item in fields(self):
             value = getattr(self, item.name)
-            if not isinstance(value, bool) and not (math.isfinite(value) and value >= 0.0):
+            if item.name == "current_rectified":
+                if not isinstance(value, bool):
+                    raise HannesError(f"Sensors: {item.name} is {value!r}; it must be true or false.")
+            elif isinstance(value, bool) or not isinstance(value, int | float):
+                raise HannesError(f"Sensors: {item.name} is {value!r}; it must be a number.")
+            elif not (math.isfinite(value) and value >= 0.0):
                 raise HannesError(f"Sensors: {item.name} is {value}; it must be finite and at least 0.")
         if self.motor_rate == 0.0 or self.reference_rate == 0.0:
             raise HannesError("Sensors: motor_rate and reference_rate must be positive.")

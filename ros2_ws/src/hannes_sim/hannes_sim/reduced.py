@@ -118,6 +118,14 @@ NO_OBJECT = 1e9
 NO_LOWEST = -1e9
 """rad; the lowest reading of an encoder of which none is known."""
 
+# Finger joints of the closed hand; the long fingers' abduction is passive and stays in the middle.
+_CLOSED = np.array(
+    [
+        0.0 if name.endswith("_abd") and not name.startswith("thumb") else JOINT_LIMITS[name].upper
+        for name in JOINT_NAMES
+    ]
+)
+
 
 def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
     p, s = pointer_f8(handle[H_PARAMETERS]), pointer_f8(handle[H_STATE])
@@ -173,20 +181,17 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
     sense(handle, q, steps)
     out[R_FORCE] = contact / p[_TIP] if p[_TIP] > 0.0 else 0.0
     out[R_Q], out[R_QL], out[R_LOAD] = q, ql, load
+    if p[_TRAVEL] > 0.0:
+        share, rate = ql / p[_TRAVEL], vl / p[_TRAVEL]
+        for j in range(N_JOINTS):
+            out[R_JOINTS + j] = share * _CLOSED[j]
+            out[R_JOINTS + N_JOINTS + j] = rate * _CLOSED[j]
     out[R_WARNING] = 0.0 if math.isfinite(q) and math.isfinite(ql) and abs(v) < 1e6 else 1.0
     if s[S_UNDEFINED] > 0.0:
         out[R_WARNING] = UNDEFINED
 
 
 _compiled = cfunc(ADVANCE_SIGNATURE, cache=True, error_model="numpy")(_advance)
-
-# Finger joints of the closed hand; the long fingers' abduction is passive and stays in the middle.
-_CLOSED = np.array(
-    [
-        0.0 if name.endswith("_abd") and not name.startswith("thumb") else JOINT_LIMITS[name].upper
-        for name in JOINT_NAMES
-    ]
-)
 
 _NAMES = {
     "supply.voltage": P_SUPPLY,
@@ -328,13 +333,6 @@ class ReducedPlant:
         self._delay[:] = 0.0
         self.reading[:] = 0.0
         self._call(self._handle_pointer, 0.0, 0)
-        self._joints()
-
-    def _joints(self) -> None:
-        share = self.reading[R_QL] / self.parameters[_TRAVEL] if self.parameters[_TRAVEL] > 0.0 else 0.0
-        rate = self.states[_SVL] / self.parameters[_TRAVEL] if self.parameters[_TRAVEL] > 0.0 else 0.0
-        self.reading[R_JOINTS : R_JOINTS + N_JOINTS] = share * _CLOSED
-        self.reading[R_JOINTS + N_JOINTS :] = rate * _CLOSED
 
     def advance(self, voltage: float, steps: int) -> None:
         with watched() as raised:
@@ -342,7 +340,6 @@ class ReducedPlant:
         if raised.said:
             raise self.effects.failed(raised.said, self.states[S_TIME_STEPS] * self.dt)
         self.check()
-        self._joints()
 
     def check(self) -> None:
         if self.reading[R_WARNING] == UNDEFINED:

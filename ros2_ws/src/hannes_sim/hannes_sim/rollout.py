@@ -109,7 +109,8 @@ class Rollout:
 
     All arrays (n,) in SI with angles at the pulley: time, reference_position, encoder_position, encoder_velocity,
     motor_current (as the sensor sees it, signed), motor_voltage (command), motor_effort, grip_force;
-    joint_positions and joint_velocities (n, 13); raw (n, N_READING) has everything that ports.R_* names.
+    joint_positions and joint_velocities (n, 13), which raise HannesError where they were left out (`rollout`);
+    raw (n, N_READING), or without joints (n, R_JOINTS), has what ports.R_* names.
     Row k holds the reading before the command of tick k.
     """
 
@@ -140,11 +141,16 @@ class Rollout:
 
     @property
     def joint_positions(self) -> Array:
-        return self.raw[:, R_JOINTS : R_JOINTS + N_JOINTS]
+        return self._joints(R_JOINTS)
 
     @property
     def joint_velocities(self) -> Array:
-        return self.raw[:, R_JOINTS + N_JOINTS : R_JOINTS + 2 * N_JOINTS]
+        return self._joints(R_JOINTS + N_JOINTS)
+
+    def _joints(self, first: int) -> Array:
+        if self.raw.shape[1] < N_READING:
+            raise HannesError("This rollout was made without the finger joints: make it with joints=True.")
+        return self.raw[:, first : first + N_JOINTS]
 
     def signal(self, name: str) -> Array:
         """A signal by its canonical name."""
