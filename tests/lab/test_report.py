@@ -14,12 +14,13 @@ from typing import Any
 import pytest
 from hannes_description.errors import HannesError
 from hannes_lab.compare import MetricRow
+from hannes_lab.diagnosis import Fall
+from hannes_lab.falls import fall_sentence
 from hannes_lab.pictures import write_picture
 from hannes_lab.report import embedded_json, render_report, write_report
 from hannes_lab.report_next import next_step
 from hannes_lab.report_text import (
-    CANNOT_TELL,
-    EITHER,
+    UNKNOWN,
     interval,
     number,
     percent,
@@ -206,13 +207,14 @@ def make_diagnosis(verdict: str) -> dict[str, Any]:
         },
         "falls": falls,
         "ranking": [
-            {"names": ["glove_stiffness"], "cost": 948.0, "explained": 0.9992},
-            {"names": ["gravity"], "cost": 1853.0, "explained": 0.41},
+            {"names": ["glove_stiffness"], "misfit": 945.0, "cost": 953.0, "explained": 0.9992},
+            {"names": ["gravity"], "misfit": 1854.0, "cost": 1862.0, "explained": 0.41},
         ],
         "depends_on": make_comparison(off=0.01)["depends_on"],
         "chance": {"misfit": 907.0, "gain": 28.6, "median": 753.0, "draws": 400, "resampled": True},
         "costs": {
             "nominal_fitted": 700.0 if verdict == "nothing" else 244979.0,
+            "critical_nominal": 900.0,
             "final": 700.0,
             "critical": 907.0,
         },
@@ -306,14 +308,13 @@ def page_of(**parts: Any) -> Page:
     return page
 
 
-@pytest.mark.parametrize("either", [EITHER, CANNOT_TELL])
-def test_the_headline_does_not_say_what_nobody_can_tell(either: str) -> None:
-    told = {
-        **make_diagnosis("unknown"),
-        "summary": f"{either}: it would explain all only with hand.stiffness.",
-    }
+@pytest.mark.parametrize("kind", UNKNOWN)
+def test_the_headline_does_not_say_what_nobody_can_tell(kind: str) -> None:
+    told = {**make_diagnosis("unknown"), "unknown_kind": kind}
     page = page_of(comparison=make_comparison(), after=None, diagnosis=told)
-    assert f"{either}." in page.words and "the catalogue does not hold" not in page.words
+    assert f"{UNKNOWN[kind]}." in page.words
+    assert ("in the catalogue." in page.words) == (kind == "not_in_catalogue")
+    assert ("Unknown effect" in page.words) == kind.startswith("not_")
 
 
 @pytest.mark.parametrize(
@@ -321,7 +322,7 @@ def test_the_headline_does_not_say_what_nobody_can_tell(either: str) -> None:
     [
         ("nothing", "Nothing is missing from the model."),
         ("effects", "The model lacks glove stiffness or gravity: these data cannot tell which."),
-        ("unknown", "Something is missing that the catalogue does not hold."),
+        ("unknown", "Something is missing that is not in the catalogue."),
     ],
 )
 def test_every_verdict(verdict: str, headline: str) -> None:
@@ -368,6 +369,8 @@ def test_what_the_page_shows_of_an_effect() -> None:
         "3 of 3 beyond chance",
         "0 of 3 beyond chance",
         "0.10 0.90 mm",
+        "1.05",
+        "2.06",
     ):
         assert part in page.words.replace("\u00a0", " "), part
     for target in [a["href"] for t, a in page.elements if t == "a"]:
@@ -423,7 +426,7 @@ def test_what_to_run_next(verdict: str, command: str, then: str | None) -> None:
 def test_ties_that_nothing_separates_give_no_command() -> None:
     diagnosis = make_diagnosis("effects")
     diagnosis["experiments"][0]["distance"] = 0.1
-    told = next_step("unknown", {"summary": f"{CANNOT_TELL}, for nothing was repeated"}, "hannes diagnose b")
+    told = next_step("unknown", {"unknown_kind": "no_repeats"}, "hannes diagnose b")
     assert (
         told is not None and told["text"].startswith("Record each motion five times") and not told["command"]
     )
@@ -468,7 +471,9 @@ def test_an_effect_that_is_found_within_chance_has_its_share() -> None:
 def test_the_ranking_says_how_many_of_the_effects_are_shown() -> None:
     diagnosis = make_diagnosis("effects")
     assert "the others are folded" not in page_of(diagnosis=diagnosis).words
-    diagnosis["ranking"] += [{"names": [f"effect_{k}"], "cost": 1e4, "explained": 0.0} for k in range(9)]
+    diagnosis["ranking"] += [
+        {"names": [f"effect_{k}"], "misfit": 1e4, "cost": 1e4, "explained": 0.0} for k in range(9)
+    ]
     words = page_of(diagnosis=diagnosis).words
     assert "The 8 that explain most; the 3 others are folded below them." in words
     assert "The 3 others" in words
@@ -547,6 +552,22 @@ def test_where_nothing_was_repeated_the_error_falls_in_the_signals_units(held: b
     assert f"{was} → {now} rad error of encoder position {where}; before: nominal, fitted" in words
     assert "No condition was repeated: there is no repeatability to hold the error against." in words
     assert "+ glove stiffness" in words and "× repeatability" not in words and "– →" not in words
+
+
+def test_the_card_and_the_summary_tell_the_same_fall() -> None:
+    """From the nominal model as it was given, where its fit is further off."""
+    diagnosis = make_diagnosis("effects")
+    for fall, error in zip(diagnosis["falls"], (2.0, 2.5, 0.95), strict=True):
+        fall["held_out"] = error
+    words = page_of(comparison=make_comparison(), diagnosis=diagnosis).words.replace("\u00a0", " ")
+    assert (
+        "2.00 → 0.95 error on held-out closures, in multiples of the repeatability; before: nominal, as given"
+        in words
+    )
+    falls = [Fall(f["added"], f["train"], f["held_out"], {}, ()) for f in diagnosis["falls"]]
+    assert fall_sentence(falls).endswith(
+        "falls from 2.00 (nominal, as given) to 0.95 times the repeatability."
+    )
 
 
 def test_overlays_of_the_same_condition_keep_their_counterparts() -> None:

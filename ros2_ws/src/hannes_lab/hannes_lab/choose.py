@@ -149,7 +149,7 @@ def choose(
         # Within chance there is nothing to explain, unless an effect gains more than chance does.
         whole = limits.median if joins is None else min(round_[0].fit.cost, limits.median)
         ranked = [*round_[:1], *short, *round_[1:]]
-        ranking = choice.ranking or tuple(Rank(c.names, c.penalised, _share(null, c, whole)) for c in ranked)
+        ranking = choice.ranking or tuple(Rank.of(c, _share(null, c, whole)) for c in ranked)
         if joins is None:
             choice = replace(choice, ranking=ranking)
             break
@@ -192,7 +192,7 @@ def must_be_held_out(features: Features) -> None:
 def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects: int) -> Choice:
     """Effects one after another while the mean square error on held-out conditions falls by at least EACH_TAKES."""
     grown = grow(search, null, max_effects, EACH_TAKES)
-    ranking = tuple(Rank(c.names, c.penalised, _share(null, c, limits.median)) for c in grown.first)
+    ranking = tuple(Rank.of(c, _share(null, c, limits.median)) for c in grown.first)
     choice = Choice(search, grown.best, limits, False, ranking, grown.rivals, grown.notes)
     return judged_by_conditions(choice, null, grown.errors[0], grown.errors[-1])
 

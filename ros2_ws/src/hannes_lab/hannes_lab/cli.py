@@ -42,7 +42,7 @@ from .diagnose import effect_sources
 from .diagnosis import Diagnosis, has_excess
 from .executor import Executor, interruptible
 from .experiments import VISIBLE, Experiment
-from .falls import NO_REPEATS, errors_in_units
+from .falls import NO_REPEATS, errors_in_units, step_name
 from .hand import HandRig
 from .own_effect import along_reference, check_own_effects, first_closure
 from .own_law import check_own_code
@@ -483,7 +483,7 @@ def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> 
         if len(fall.by_condition) > 1:
             conditions = f"{number(fall.held_out_conditions, 3)} ({conditions})"
         table.add_row(
-            ("+ " if k > 1 else "") + fall.added,
+            step_name(k, fall.added),
             number(fall.train, 3),
             number(fall.held_out, 3),
             conditions,
@@ -507,9 +507,7 @@ def _show_falls_in_units(found: Diagnosis | Addition, units: dict[str, str]) -> 
     for signal in steps[-1]:
         table.add_column(_heading(signal, units[signal]), justify="right")
     for k, (fall, errors) in enumerate(zip(found.falls, steps, strict=True)):
-        table.add_row(
-            ("+ " if k > 1 else "") + fall.added, *(number(errors.get(s, math.nan), 3) for s in steps[-1])
-        )
+        table.add_row(step_name(k, fall.added), *(number(errors.get(s, math.nan), 3) for s in steps[-1]))
     show_table(table, TEXT_WIDTH)
 
 

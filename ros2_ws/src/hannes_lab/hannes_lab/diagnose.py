@@ -34,7 +34,14 @@ from .diagnosis import Diagnosis, Fall, FoundEffect, ParameterEstimate
 from .errors import SignalError
 from .executor import Executor
 from .experiments import separating_experiments
-from .falls import WITHOUT_EFFECT, deciding_errors, error_falls, left_out_errors, worth_showing
+from .falls import (
+    NOMINAL_FITTED,
+    WITHOUT_EFFECT,
+    deciding_errors,
+    error_falls,
+    left_out_errors,
+    worth_showing,
+)
 from .features import data_used
 from .fit import Fit
 from .greedy import OF_NOMINAL
@@ -52,6 +59,7 @@ from .wording import (
     notes,
     other_clock,
     summary,
+    unknown_kind,
     worse_fitted,
 )
 
@@ -143,7 +151,7 @@ def diagnose(
     intervals = spans_of(search, best, limits, falls)
     effects = found_effects(search, best, intervals, falls)
     clock = other_clock(search.problem, best.fit) if greedy or verdict == "unknown" else None
-    same = twins(search, best, far_off(best))
+    kind = unknown_kind(search, effects, choice, answer.bent, only) if verdict == "unknown" else ""
     depends_on = residual_dependences(
         prepared.features,
         prepared.features.closures(prepared.rig, best.fit.model, best.fit.values),
@@ -158,17 +166,18 @@ def diagnose(
         summary=summary(
             search,
             verdict,
-            effects,
-            tied,
-            falls,
-            limits,
-            choice,
-            best,
-            answer.bent,
-            only,
-            clock,
-            greedy,
-            same,
+            kind=kind,
+            effects=effects,
+            tied=tied,
+            falls=falls,
+            limits=limits,
+            choice=choice,
+            best=best,
+            bent=answer.bent,
+            only=only,
+            clock=clock,
+            greedy=greedy,
+            twins=twins(search, best, far_off(best)),
         ),
         effects=effects,
         tied=tied,
@@ -177,7 +186,12 @@ def diagnose(
         ranking=choice.ranking,
         depends_on=depends_on,
         chance=limits,
-        costs={"nominal_fitted": answer.null.fit.cost, "final": best.fit.cost, "critical": limits.misfit},
+        costs={
+            "nominal_fitted": answer.null.fit.cost,
+            "critical_nominal": answer.first.misfit,
+            "final": best.fit.cost,
+            "critical": limits.misfit,
+        },
         nuisances=_nuisance_table(best.fit, intervals),
         notes=(
             *((pointer,) if pointer else ()),
@@ -193,6 +207,7 @@ def diagnose(
         model=fitted_model(prepared.model, search, best, intervals),
         values=best.fit.values,
         nominal=answer.null.fit.values,
+        unknown_kind=kind,
         greedy=greedy,
         moved=moved,
     )
@@ -202,12 +217,13 @@ def diagnose(
 class _Answer:
     """What a search came to.
 
-    null   the nominal model, fitted
+    null   the nominal model, fitted; first  what chance reaches there
     bent   why what chance explains is no answer, if it is none
     holds  whether the choice is an answer
     """
 
     null: Candidate
+    first: Chance
     choice: Choice
     falls: tuple[Fall, ...]
     bent: str
@@ -244,7 +260,7 @@ def _answer(prepared: Prepared, search: Search, max_effects: int, greedy: bool) 
         if instead is not choice:
             choice, null, falls = instead, first.null(), falls_of(instead, first)
         bent = bent_sentence(choice, falls)
-    return _Answer(null, choice, falls, bent, holds and not bent)
+    return _Answer(null, limits, choice, falls, bent, holds and not bent)
 
 
 def _behind_the_law(
@@ -279,7 +295,7 @@ def _borne_out(choice: Choice, null: Candidate, falls: tuple[Fall, ...]) -> tupl
     if not alone:
         return choice, falls
     deciding = deciding_errors(falls)
-    first, last = deciding[WITHOUT_EFFECT - 1], deciding[-1]
+    first, last = deciding[NOMINAL_FITTED], deciding[-1]
     fewer = replace(choice, best=best, rivals=(), notes=notes)
     return judged_by_conditions(fewer, null, first, last), falls
 
@@ -383,17 +399,17 @@ def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple
     does what the other did, and foretells the same.
     """
     rig = choice.search.problem.rig
-    keep = len(falls) - 2
-    while keep and not _foretells(falls[: keep + 2]):
+    keep = len(falls) - WITHOUT_EFFECT
+    while keep and not _foretells(falls[: keep + WITHOUT_EFFECT]):
         keep -= 1
     if keep == len(choice.best.names) or not (rig.foreign or choice.search.problem.discrepancy):
         return choice, falls
-    part = choice.search.fit_of([fall.added for fall in falls[2 : keep + 2]])
+    part = choice.search.fit_of([fall.added for fall in falls[WITHOUT_EFFECT : keep + WITHOUT_EFFECT]])
     if not is_adequate(choice.search, part, choice.limits):
         return choice, falls
     if leads_back(part, choice.best):
         return replace(choice, notes=(*choice.notes, led_back_sentence(choice.best, part))), falls
-    fewer = falls[: keep + 2]
+    fewer = falls[: keep + WITHOUT_EFFECT]
     idle = idle_sentence(choice.best, part, falls[-1], fewer[-1])
     return _with_unnamed(cut_to(choice, part), idle), fewer
 

@@ -11,11 +11,10 @@ from hannes_description.model import Model
 
 from .chance import Chance
 from .depends import Dependence
-from .errors import (
-    SignalError,
-)
+from .errors import SignalError
 from .experiments import Experiment
 from .prepare import Prepared
+from .search import Candidate
 
 
 @dataclass(frozen=True)
@@ -89,19 +88,40 @@ class Fall:
 
 @dataclass(frozen=True)
 class Rank:
-    """One row of the ranking: the cost of the model with this effect (set) added, after a full refit."""
+    """One row of the ranking: what is left of the misfit with this effect (or set) added to the nominal model.
+
+    The noise is that which the nominal model shows.  Only the best are fitted to the end: of the others more is left
+    than need be.
+
+    misfit     squared residuals over noise, and what the tolerances charge
+    cost       the same, and PENALTY for each parameter of the effects
+    explained  part of the nominal model's excess misfit, by `cost`
+    """
 
     names: tuple[str, ...]
+    misfit: float
     cost: float
     explained: float
 
+    @classmethod
+    def of(cls, candidate: Candidate, explained: float) -> Rank:
+        return cls(candidate.names, candidate.fit.cost, candidate.penalised, explained)
+
     def to_dict(self) -> dict[str, Any]:
-        return {"names": list(self.names), "cost": self.cost, "explained": self.explained}
+        return {
+            "names": list(self.names),
+            "misfit": self.misfit,
+            "cost": self.cost,
+            "explained": self.explained,
+        }
 
 
 def has_excess(costs: Mapping[str, Any], named: bool) -> bool:
-    """Whether there is a misfit to share out among effects: none below what chance reaches, unless one was named."""
-    critical, nominal = costs.get("critical"), costs.get("nominal_fitted")
+    """Whether there is a misfit to share out among effects: none below what chance reaches, unless one was named.
+
+    costs  as Diagnosis has them
+    """
+    critical, nominal = costs.get("critical_nominal"), costs.get("nominal_fitted")
     return named or critical is None or nominal is None or nominal > critical
 
 
@@ -117,6 +137,9 @@ def both_models(given: Model, fitted: Model) -> dict[str, Any]:
 class Diagnosis:
     """The answer; `to_dict` is what --json, the report and the page show.
 
+    unknown_kind  of the verdict "unknown", one of report_text.UNKNOWN; else empty
+    costs   misfits: nominal_fitted and what chance reaches there (critical_nominal, with the noise that the nominal
+            model shows), final and critical (with the noise that the answer shows)
     given   the model in which effects were looked for
     model   the same with what was found, fitted; `values` are those of all that was free
     nominal  those of the given model, fitted without effects
@@ -142,6 +165,7 @@ class Diagnosis:
     model: Model
     values: Mapping[str, float]
     nominal: Mapping[str, float]
+    unknown_kind: str = ""
     greedy: bool = False
     moved: Prepared | None = field(default=None, repr=False, compare=False)
 
@@ -149,6 +173,7 @@ class Diagnosis:
         falls = self.falls
         return {
             "verdict": self.verdict,
+            "unknown_kind": self.unknown_kind,
             "summary": self.summary,
             "effects": [e.to_dict() for e in self.effects],
             "tied": [list(names) for names in self.tied],

@@ -27,6 +27,9 @@ from .surrogate import exact_rig
 WITHOUT_EFFECT = 2
 """Steps of an error that falls before the first effect: the nominal model as given, and fitted."""
 
+NOMINAL_FITTED = WITHOUT_EFFECT - 1
+"""Number of the step that is the fitted nominal model."""
+
 NO_REPEATS = "No condition was repeated: there is no repeatability to hold the error against."
 
 
@@ -109,11 +112,11 @@ def worth_showing(
     search: Search, best: Candidate, falls: tuple[Fall, ...]
 ) -> tuple[Candidate, tuple[Fall, ...]]:
     """The effects up to that with which what was left out is foretold best: what follows only fits better."""
-    errors = left_out_errors(falls)[1:]
+    errors = left_out_errors(falls)[NOMINAL_FITTED:]
     if not np.isfinite(errors).any():
         return best, falls
-    keep = 1 + int(np.nanargmin(errors))
-    names = tuple(fall.added for fall in falls[2 : keep + 1])
+    keep = NOMINAL_FITTED + int(np.nanargmin(errors))
+    names = tuple(fall.added for fall in falls[WITHOUT_EFFECT : keep + 1])
     if len(names) == len(best.names):
         return best, falls
     return search.fit_of(names), falls[: keep + 1]
@@ -136,7 +139,7 @@ def relative_errors(falls: Sequence[Fall]) -> list[float]:
 
     It needs no repeatability; NaN where no condition could be held out.
     """
-    base = falls[WITHOUT_EFFECT - 1].held_out_signals
+    base = falls[NOMINAL_FITTED].held_out_signals
     out = []
     for fall in falls:
         ratios = [fall.held_out_signals.get(s, np.nan) / error for s, error in base.items() if error > 0.0]
@@ -144,29 +147,43 @@ def relative_errors(falls: Sequence[Fall]) -> list[float]:
     return out
 
 
+def before(errors: Sequence[float]) -> int:
+    """Number of the step from which errors fall: the nominal model as given or fitted, whichever is nearer.
+
+    A fit weighs what is known of the model's own error, and tolerances, which errors do not: it may raise them.
+    """
+    first = np.asarray(errors[:WITHOUT_EFFECT], dtype=np.float64)
+    return int(np.nanargmin(first)) if np.isfinite(first).any() else NOMINAL_FITTED
+
+
+def step_name(number: int, added: str) -> str:
+    """A step of the fall as tables and pages name it: what was added has a plus."""
+    return added if number < WITHOUT_EFFECT else f"+ {added}"
+
+
 def fall_sentence(falls: Sequence[Fall], by_conditions: bool = False) -> str:
     """How the error on held-out closures falls, or that it does not; in the signals' units where nothing was repeated.
 
     Where no effect was added, what it is.  by_conditions: that on held-out conditions decided, and comes first.
-
-    A fit weighs what is known of the model's own error; the error does not: it falls from that of the nominal model as
-    it was given, where its fit made it larger.
     """
-    if by_conditions and np.isfinite([fall.held_out_conditions for fall in (*falls[:2], falls[-1])]).all():
+    if (
+        by_conditions
+        and np.isfinite([f.held_out_conditions for f in (*falls[:WITHOUT_EFFECT], falls[-1])]).all()
+    ):
         return _by_conditions(falls)
-    first, after = min(falls[:2], key=lambda fall: fall.held_out), falls[-1].held_out
-    before = first.held_out
-    if not np.isfinite([before, after]).all():
+    first, after = falls[before([fall.held_out for fall in falls])], falls[-1].held_out
+    nominal = first.held_out
+    if not np.isfinite([nominal, after]).all():
         return f"{NO_REPEATS} {_in_units(falls)}".rstrip()
     if len(falls) == WITHOUT_EFFECT:
-        given = f" ({before:.2f} as it was given)" if before < after else ""
+        given = f" ({nominal:.2f} as it was given)" if nominal < after else ""
         return f"The error on held-out closures is {after:.2f} times the repeatability{given}."
-    verb = "falls" if after <= before else "rises"
+    verb = "falls" if after <= nominal else "rises"
     said = (
-        f"The error on held-out closures {verb} from {before:.2f} ({first.added}) to {after:.2f} times the "
+        f"The error on held-out closures {verb} from {nominal:.2f} ({first.added}) to {after:.2f} times the "
         "repeatability"
     )
-    if after <= before:
+    if after <= nominal:
         return f"{said}."
     old, new = first.by_condition, falls[-1].by_condition
     each = [f"'{name}' from {old[name]:.2f} to {error:.2f}" for name, error in new.items() if name in old]
@@ -176,8 +193,8 @@ def fall_sentence(falls: Sequence[Fall], by_conditions: bool = False) -> str:
 def _by_conditions(falls: Sequence[Fall]) -> str:
     """The same of conditions that were left out of the fit as a whole, with what the closures say beside it."""
     what = "The error on conditions that were left out of the fit"
-    first, last = min(falls[:2], key=lambda fall: fall.held_out_conditions), falls[-1]
-    before, after = first.held_out_conditions, last.held_out_conditions
+    first, last = falls[before([fall.held_out_conditions for fall in falls])], falls[-1]
+    nominal, after = first.held_out_conditions, last.held_out_conditions
     if len(falls) == WITHOUT_EFFECT:
         closures = f" ({last.held_out:.2f} on held-out closures)" if np.isfinite(last.held_out) else ""
         return f"{what} is {after:.2f} times the repeatability{closures}."
@@ -186,9 +203,9 @@ def _by_conditions(falls: Sequence[Fall]) -> str:
         if np.isfinite([first.held_out, last.held_out]).all()
         else ""
     )
-    verb = "falls" if after <= before else "rises"
+    verb = "falls" if after <= nominal else "rises"
     return (
-        f"{what} {verb} from {before:.2f} ({first.added}) to {after:.2f} times the repeatability{closures}."
+        f"{what} {verb} from {nominal:.2f} ({first.added}) to {after:.2f} times the repeatability{closures}."
     )
 
 
@@ -214,7 +231,7 @@ def _in_units(falls: Sequence[Fall]) -> str:
     """How the error of each signal changes from the fitted nominal model to the last step."""
     held, steps = errors_in_units([fall.to_dict() for fall in falls])
     units = {e.signal: e.unit for e in falls[-1].signals}
-    old, new = steps[1], steps[-1]
+    old, new = steps[NOMINAL_FITTED], steps[-1]
     each = [
         f"{name} "
         + (f"{new[name]:.3g}" if len(falls) == WITHOUT_EFFECT else f"from {old[name]:.3g} to {new[name]:.3g}")

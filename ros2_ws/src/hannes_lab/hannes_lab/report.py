@@ -26,7 +26,7 @@ from markupsafe import Markup
 from . import report_text as text
 from .diagnosis import has_excess
 from .experiments import VISIBLE
-from .falls import errors_in_units
+from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, before, errors_in_units, step_name
 from .report_next import SHOWN, how_sure, next_step, runner_up
 from .report_svg import curve_svg, overlay_svg, tick_text
 
@@ -225,9 +225,7 @@ def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | No
     elif kind == "effects":
         headline = lacking(diagnosis, names)
     elif kind == "unknown":
-        summary = str((diagnosis or {}).get("summary", ""))
-        begins = next((b for b in (text.EITHER, text.CANNOT_TELL) if summary.startswith(b)), None)
-        headline = f"{begins or 'Something is missing that the catalogue does not hold'}."
+        headline = f"{text.UNKNOWN[_unknown_kind(diagnosis)]}."
     elif kind == "added":
         headline = f"The model has {text.listed(names)} now."
     elif kind != "comparison":
@@ -245,7 +243,7 @@ def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | No
     label = {
         "nothing": "Complete",
         "effects": "Effects found" if len(names) > 1 else "Effect found",
-        "unknown": "Unknown effect",
+        "unknown": "Unknown effect" if _unknown_kind(diagnosis).startswith("not_") else "Unknown",
         "comparison": "Comparison",
         "added": "Added",
     }.get(kind, "Verdict")
@@ -256,6 +254,10 @@ def verdict_of(comparison: Part | None, after: Part | None, diagnosis: Part | No
         "summary": str(diagnosis.get("summary", "")) if diagnosis is not None else "",
         "figures": _figures(comparison, after, diagnosis),
     }
+
+
+def _unknown_kind(diagnosis: Part | None) -> str:
+    return str((diagnosis or {}).get("unknown_kind") or "not_in_catalogue")
 
 
 def lacking(diagnosis: Part | None, titles: Sequence[str]) -> str:
@@ -283,7 +285,10 @@ def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None
     now = after if after is not None else comparison
     in_units = fall_in_units(falls)
     if in_units is not None and len(falls) > 1:
-        start, end = in_units["rows"][1 if len(falls) > 2 else 0], in_units["rows"][-1]
+        start, end = (
+            in_units["rows"][NOMINAL_FITTED if len(falls) > WITHOUT_EFFECT else 0],
+            in_units["rows"][-1],
+        )
         where = "on conditions that were left out of the fit" if in_units["held"] else "of the fit"
         for k, (signal, unit) in enumerate(in_units["signals"][:FIGURES]):
             out.append(
@@ -294,9 +299,11 @@ def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None
                 }
             )
     elif len(falls) > 1:
-        first = falls[1] if len(falls) > 2 else falls[0]
         whole = bool((diagnosis or {}).get("greedy"))
         key, what = ("held_out_conditions", "conditions") if whole else ("held_out", "closures")
+        errors = [text.known(fall.get(key)) for fall in falls]
+        nearer = before([math.nan if e is None else e for e in errors])
+        first = falls[nearer if len(falls) > WITHOUT_EFFECT else 0]
         out.append(
             {
                 "value": text.ratio(falls[-1].get(key)),
@@ -374,8 +381,8 @@ def fall_in_units(falls: Sequence[Part]) -> dict[str, Any] | None:
     for k, (fall, errors) in enumerate(zip(falls, steps, strict=True)):
         values = [text.known(errors.get(s)) for s in signals]
         added = str(fall.get("added", ""))
-        label = added if k < 2 else f"+ {text.words(added)}"
-        rows.append({"label": label, "kind": "before" if k < 2 else "after", "values": values})
+        label, kind = step_name(k, text.words(added)), "before" if k < WITHOUT_EFFECT else "after"
+        rows.append({"label": label, "kind": kind, "values": values})
     if not signals:
         return None
     largest = [max((r["values"][k] or 0.0 for r in rows), default=0.0) for k in range(len(signals))]
@@ -417,8 +424,8 @@ def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:
         by_condition = fall.get("by_condition", {})
         rows.append(
             {
-                "label": added if k < 2 else f"+ {text.words(added)}",
-                "kind": "before" if k < 2 else "after",
+                "label": step_name(k, text.words(added)),
+                "kind": "before" if k < WITHOUT_EFFECT else "after",
                 "train": fall.get("train"),
                 "held_out": fall.get("held_out"),
                 "train_at": place(fall.get("train")),
@@ -615,19 +622,19 @@ def ranking(diagnosis: Part | None) -> dict[str, Any] | None:
     if diagnosis is None or not rows:
         return None
     critical, nominal = (
-        text.known((diagnosis.get("costs") or {}).get(k)) for k in ("critical", "nominal_fitted")
+        text.known((diagnosis.get("costs") or {}).get(k)) for k in ("critical_nominal", "nominal_fitted")
     )
     found = {str(e.get("name")) for e in _list(diagnosis, "effects")}
-    excess = has_excess({"critical": critical, "nominal_fitted": nominal}, bool(found))
+    excess = has_excess(diagnosis.get("costs") or {}, bool(found))
     out = []
     for row in rows:
-        cost, share = text.known(row.get("cost")), text.known(row.get("explained")) if excess else None
+        left, share = text.known(row.get("misfit")), text.known(row.get("explained")) if excess else None
         out.append(
             {
                 "label": " + ".join(text.words(n) for n in row.get("names", [])),
-                "cost": cost,
+                "misfit": left,
                 "explained": share,
-                "of_chance": cost / critical if cost is not None and critical else None,
+                "of_chance": left / critical if left is not None and critical else None,
                 "width": round(100.0 * min(1.0, max(0.0, share or 0.0)), 2),
                 "found": set(row.get("names", [])) <= found and bool(found),
             }

@@ -43,7 +43,7 @@ def next_step(kind: str, diagnosis: Part | None, command: str) -> dict[str, str]
         words = ["hannes", "diagnose", *("--report" if w == "--out" else w for w in words[2:])]
     if kind == "effects":
         return {"text": "Write the model with it to a file", "command": shlex.join([*words, "--add"])}
-    if str((diagnosis or {}).get("summary", "")).startswith(text.CANNOT_TELL):
+    if (diagnosis or {}).get("unknown_kind") == "no_repeats":
         return {
             "text": "Record each motion five times or more: only repeats tell what is scatter",
             "command": "",

@@ -10,11 +10,17 @@ from typing import Any
 DASH = "–"
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
-EITHER = "Something is missing, or the nominal model is not that of this machine"
-"""How a summary begins where nobody can tell which."""
+UNKNOWN = {
+    "not_in_catalogue": "Something is missing that is not in the catalogue",
+    "not_looked_for": "Something is missing that is not one of those that were looked for",
+    "model_or_effect": "Something is missing, or the nominal model is not that of this machine",
+    "no_repeats": "Whether something is missing cannot be told",
+}
+"""What is said first of each kind of "unknown" (`Diagnosis.unknown_kind`).
 
-CANNOT_TELL = "Whether something is missing cannot be told"
-"""How one begins where nothing was repeated, and nothing brings what was left out nearer."""
+Nobody can tell the third from the first two; the last is where nothing was repeated, and nothing brings what was left
+out nearer.
+"""
 
 NO_FINDING = "These effects come nearest. They are no finding, whatever their intervals: more is missing."
 

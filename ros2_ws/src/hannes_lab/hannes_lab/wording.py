@@ -13,10 +13,10 @@ from .choose import Choice, can_be_held_out, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
-from .falls import WITHOUT_EFFECT, fall_sentence, left_out_errors
+from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, fall_sentence, left_out_errors
 from .fit import Fit, fit
 from .problem import Coordinate, Problem, nuisance_coordinate
-from .report_text import CANNOT_TELL, EITHER, listed
+from .report_text import UNKNOWN, listed
 from .rig import Nuisance
 from .search import FAR, PENALTY, Candidate, Search, key_of
 
@@ -59,30 +59,45 @@ MANY_FAILURES = 0.05
 """Part of the simulations that did not stay finite from which on their parameters are worth a look."""
 
 
+def unknown_kind(
+    search: Search, effects: Sequence[FoundEffect], choice: Choice, bent: str, only: Sequence[str]
+) -> str:
+    """Which kind of "unknown" an answer is, a key of UNKNOWN; see `summary` for `bent` and `only`."""
+    repeated = search.problem.features.repeated
+    if not (effects or bent or repeated):
+        return "no_repeats"
+    if choice.other_model or not repeated or (bent and not effects):
+        return "model_or_effect"
+    return "not_looked_for" if only else "not_in_catalogue"
+
+
 def summary(
     search: Search,
     verdict: str,
+    *,
+    kind: str,
     effects: Sequence[FoundEffect],
     tied: Sequence[Sequence[str]],
     falls: Sequence[Fall],
     limits: Chance,
     choice: Choice,
     best: Candidate,
-    bent: str = "",
-    only: Sequence[str] = (),
-    clock: Clock | None = None,
-    greedy: bool = False,
-    twins: Mapping[str, Sequence[str]] | None = None,
+    bent: str,
+    only: Sequence[str],
+    clock: Clock | None,
+    greedy: bool,
+    twins: Mapping[str, Sequence[str]],
 ) -> str:
     """The verdict in a sentence or two: what is missing, how the error falls, and what to be careful with.
 
+    kind  of the verdict "unknown" (see unknown_kind)
     bent  why the set that chance explains is no answer, if it is none
     twins effects that do the same as a parameter that is far off, by its name
     clock what another clock of the reference would remove
     only  the effects that were looked for, where those are not the whole catalogue
     """
     fall = fall_sentence(falls, greedy)
-    far = _moved_far(best, twins or {})
+    far = _moved_far(best, twins)
     if verdict == "nothing":
         explained = (
             f"the model's misfit {best.fit.cost:.0f} is {'below' if best.fit.cost < limits.misfit else 'little above'} "
@@ -109,24 +124,22 @@ def summary(
             others = "; ".join(" + ".join(names_) for names_ in tied[1:])
             tie = f" With these data it ties with: {others}."
         return f"Missing: {names}. {fall}{tie}{far}"
-    if not names and bent:
-        return f"{EITHER}: {bent}. {fall}{nearest_sentence(choice)}"
+    if bent and not names:
+        return f"{UNKNOWN[kind]}: {bent}. {fall}{nearest_sentence(choice)}"
     part = f" Nearest comes {names}, which is not enough." if names else ""
     why = bent or choice.left or f"the best model's {shortfall(search, best, limits)}"
-    beyond = (
-        f"is not one of those that were looked for ({_listed(only)})" if only else "is not in the catalogue"
-    )
     first = f" First look at the clock: {clock.said}." if clock and clock.part >= CLOCK_LEADS else ""
-    features = search.problem.features
-    if not (names or bent or features.repeated):
-        held = len(features.conditions) > 1
+    if kind == "no_repeats":
+        held = len(search.problem.features.conditions) > 1
         nearer = ", and what was looked for brings nothing that was left out nearer by enough" if held else ""
         return (
-            f"{CANNOT_TELL}, for nothing was repeated: {why}, but a guess stands for the "
+            f"{UNKNOWN[kind]}, for nothing was repeated: {why}, but a guess stands for the "
             f"scatter{nearer}.{first} {fall}{far}"
         )
-    start = EITHER if choice.other_model or not features.repeated else f"Something is missing that {beyond}"
-    return f"{start}: {why}.{first}{part} {fall}{'' if choice.other_model or bent else far}"
+    looked_for = f" ({_listed(only)})" if kind == "not_looked_for" else ""
+    return (
+        f"{UNKNOWN[kind]}{looked_for}: {why}.{first}{part} {fall}{'' if choice.other_model or bent else far}"
+    )
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -141,7 +154,7 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
     fit does not fall to half of what it is above the repeatability, the effects only help to bend the model.  Where the
     model alone does so, and leaves more than LEFT, something of the same form may be missing: nobody can tell.
     """
-    best, before, after = choice.best, falls[1], falls[-1]
+    best, before, after = choice.best, falls[NOMINAL_FITTED], falls[-1]
     if not (best.far_off and choice.search.problem.discrepancy):
         return ""
     if not best.names:
@@ -167,7 +180,7 @@ def worse_fitted(falls: Sequence[Fall]) -> tuple[str, ...]:
     if not fitted > given:
         return ()
     said = f"{fitted:.2f}) than as given ({given:.2f} times the repeatability"
-    if not np.isfinite(falls[1].held_out):
+    if not np.isfinite(falls[NOMINAL_FITTED].held_out):
         said = f"on conditions that were left out) than as given ({given:.2f} of the error"
     return (
         f"the nominal model is further off as fitted ({said}): a fit weighs each sample by how well it is known and "
