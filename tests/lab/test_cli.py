@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from hannes_description.model import Model
-from hannes_lab.cli import _relative_error
 from hannes_lab.cli_files import check_writable
+from hannes_lab.cli_show import relative_error
 from hannes_lab.compare import MetricRow
 from hannes_lab.wording import failure_notes
 from hannes_sim.effect import load_effect
@@ -301,7 +301,7 @@ def test_hide_refuses_what_would_hide_something_else(
 )
 def test_a_relative_error_can_be_read(measured: float, sd: float, model: float, said: str) -> None:
     percent = (measured - model) / measured * 100.0 if measured else math.nan
-    assert _relative_error(MetricRow("slow", "closure_time", "s", measured, sd, model, percent)) == said
+    assert relative_error(MetricRow("slow", "closure_time", "s", measured, sd, model, percent)) == said
 
 
 def test_simulations_that_failed_are_harmless_where_they_are_few() -> None:

@@ -23,7 +23,7 @@ from hannes_description.signals import SIGNALS, Signal
 from . import cdr
 from .clocks import SAME_NS, ClockRelation, relate
 from .mcap_file import Limits
-from .recording import HOW_TO_NAME, Channel, Recording
+from .recording import HOW_TO_NAME, LOOKS_LIKE, Channel, Recording
 from .storage import BagMessages, TopicEntry, locate
 
 IntArray = npt.NDArray[np.int64]
@@ -569,12 +569,12 @@ class _Reader:
             extent, what = float(np.abs(channel.values).max()), "reaches"
         if extent > limit:
             self.warnings.append(
-                f"{channel.name} {what} {extent:.4g} {channel.unit}, which looks like {guess} "
+                f"{channel.name} {what} {extent:.4g} {channel.unit}, {LOOKS_LIKE} {guess} "
                 f"rather than {channel.unit}."
             )
         elif channel.name.endswith("_position") and extent > _DEGREES:
             self.warnings.append(
-                f"{channel.name} {what} {extent:.4g} {channel.unit}, which looks like degrees rather than "
+                f"{channel.name} {what} {extent:.4g} {channel.unit}, {LOOKS_LIKE} degrees rather than "
                 f"{channel.unit} (a full closure is 14.57 rad)."
             )
 

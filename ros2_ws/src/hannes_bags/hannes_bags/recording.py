@@ -27,6 +27,9 @@ _TEXT_SIGNALS = frozenset(name for name, signal in SIGNALS.items() if signal.typ
 HOW_TO_NAME = "--topic SIGNAL=TOPIC (topics={signal: topic} in Python)"
 """How the topic of a signal is said, on the command line and in Python."""
 
+LOOKS_LIKE = "which looks like"
+"""In the warning of a reader that guesses at another unit; what converts units leaves such warnings out."""
+
 _COLUMNS = {"joint_positions": len(JOINT_NAMES), "joint_velocities": len(JOINT_NAMES)}
 _VECTOR_SIGNALS = frozenset(_COLUMNS) | {
     name for name, signal in SIGNALS.items() if signal.type == "std_msgs/msg/Float64MultiArray"

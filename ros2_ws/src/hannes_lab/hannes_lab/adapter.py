@@ -138,15 +138,16 @@ def check_trials(found: object, rig: str) -> list[Trial]:
             f"{rig}.read returned a list with {kind_of(strange)} in it; each must be a hannes_lab.trials.Trial."
         )
     kept: list[Trial] = []
-    without: list[str] = []
+    without: list[NoClosure] = []
     for trial in trials:
         try:
             kept.append(_checked(trial, f"{rig}, trial '{trial.name}'"))
         except NoClosure as none:
-            without.append(OfAll(f"left out: {none}"))
+            without.append(none)
     if not kept:
-        raise NoClosure(without[0].removeprefix("left out: "))
-    return unique_names([replace(kept[0], notes=(*kept[0].notes, *without)), *kept[1:]], conditions=False)
+        raise without[0]
+    notes = (*kept[0].notes, *(OfAll(f"left out: {none}") for none in without))
+    return unique_names([replace(kept[0], notes=notes), *kept[1:]], conditions=False)
 
 
 def _checked(trial: Trial, where: str) -> Trial:

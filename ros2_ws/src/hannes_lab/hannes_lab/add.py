@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -100,7 +100,7 @@ def add_effects(
     intervals = spans_of(search, best, limits, falls)
     return Addition(
         prepared.model,
-        with_provenance(fitted_model(prepared.model, search, best, intervals), prepared, falls),
+        fitted_model(prepared, search, best, intervals, falls),
         found_effects(search, best, intervals, falls),
         falls,
         data_used(prepared.features),
@@ -108,27 +108,6 @@ def add_effects(
         best.fit.values,
         null.fit.values,
         None if prepared is given else prepared,
-    )
-
-
-def with_provenance(model: Model, prepared: Prepared, falls: Sequence[Fall], command: str = "") -> Model:
-    """The model with what it was made from: bags with hashes, errors, command."""
-    return replace(
-        model,
-        provenance={
-            **dict(model.provenance),
-            "bags": [
-                {"source": d["source"], "sha256": d["sha256"], "closures": d["closures"]}
-                for d in data_used(prepared.features)
-            ],
-            "nominal_sha256": prepared.model.sha256,
-            "error_unit": "multiples of the repeatability between closures",
-            "falls": [
-                {"added": f.added, "train": round(f.train, 4), "held_out": round(f.held_out, 4)}
-                for f in falls
-            ],
-            **({"command": command} if command else {}),
-        },
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -13,12 +12,13 @@ from typing import Annotated, Any, cast
 import numpy as np
 import typer
 from hannes_description.errors import HannesError
-from hannes_description.output import estimate, number, print_json, text_console
+from hannes_description.output import estimate, number, text_console
 from numpy.typing import NDArray
 
 from .cache import code_hash, content_hash, default_folder
-from .cli import Scale, Topics, _command, _prepared, _Progress
-from .cli_files import check_model_file
+from .cli_files import Output, check_model_file, deliver
+from .cli_options import Scale, Topics
+from .cli_progress import ConsoleProgress
 from .errors import held_out_closures, overall, signal_errors
 from .executor import interruptible
 from .features import data_used
@@ -36,8 +36,10 @@ from .identify import (
 )
 from .prepare import Prepared
 from .problem import Coordinate, Problem, build_problem, nuisance_coordinate
+from .provenance import made_from, own_command, save_model
 from .remembered import Remembered
 from .search import Progress
+from .session import prepared_from
 
 Array = NDArray[np.float64]
 
@@ -114,19 +116,14 @@ def calibrate(
     if progress is not None:
         progress(again.total, again.total, "done")
     bags = ", ".join(str(d["name"]) for d in used)
-    made = calibrated_model(model, parameters, f"calibrated on {bags}")
-    made = replace(
-        made,
-        provenance={
-            **dict(model.provenance),
-            "bags": [{"source": d["source"], "sha256": d["sha256"], "closures": d["closures"]} for d in used],
-            "nominal_sha256": model.sha256,
-            "free": list(free),
-            "intervals_95": {p.name: [float(f"{p.low:.5g}"), float(f"{p.high:.5g}")] for p in parameters},
-            "error_unit": "multiples of the repeatability between closures",
-            "errors": {k: round(v, 4) for k, v in errors.items() if math.isfinite(v)},
-            "recordings": {n: float(f"{v:.6g}") for n, v in best.values.items() if n not in free},
-        },
+    made = made_from(
+        calibrated_model(model, parameters, f"calibrated on {bags}"),
+        model,
+        features,
+        free=list(free),
+        intervals_95={p.name: [float(f"{p.low:.5g}"), float(f"{p.high:.5g}")] for p in parameters},
+        errors={k: round(v, 4) for k, v in errors.items() if math.isfinite(v)},
+        recordings={n: float(f"{v:.6g}") for n, v in best.values.items() if n not in free},
     )
     notes = warnings_of(parameters, len(free), features.size)
     notes += _notes_of_errors(errors, best, explaining(best, held, by_held))
@@ -269,9 +266,9 @@ def command(
             raise HannesError(f"--prior {text}: give NAME=SD with a number.") from None
         if name not in names:
             raise HannesError(f"--prior {text}: '{name}' is not among --free.")
-    with _Progress(quiet=json) as progress:
+    with ConsoleProgress(quiet=json) as progress:
         progress(0, 1, "reading the bags")
-        prepared = _prepared(bags, model, None, None, scale=scale, topics=topics)
+        prepared = prepared_from(bags, model, None, None, scale=scale, topics=topics)
         found = calibrate(
             prepared,
             names,
@@ -281,18 +278,8 @@ def command(
             cache=cache or default_folder("calibrate"),
             progress=progress,
         )
-    made = replace(
-        found.model, name=out.stem, provenance={**dict(found.model.provenance), "command": _command()}
-    )
-    try:
-        if json:
-            print_json(found.to_dict() | {"model_file": str(out)})
-        else:
-            _show(found)
-    finally:
-        made.save(out)
-    if not json:
-        typer.echo(f"Model file: {out}")
+    model_file = Output("Model file", out, lambda to: save_model(found.model, to, own_command()))
+    deliver(json, found.to_dict() | {"model_file": str(out)}, lambda: _show(found), [model_file])
 
 
 def _show(found: Calibration) -> None:

@@ -2,9 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import typer
 from hannes_description.errors import HannesError
+from hannes_description.output import print_json
+
+
+class Output(NamedTuple):
+    """A file that a command writes: what it is (\"Report\"), where, and what writes it there."""
+
+    what: str
+    path: Path
+    write: Callable[[Path], None]
+
+
+def deliver(
+    json: bool, content: Mapping[str, Any], show: Callable[[], None], files: Sequence[Output] = ()
+) -> None:
+    """Print an answer as JSON, or show it and say where its files are.
+
+    Each file is written whatever happens before: whoever reads the answer may be gone, or another file's disk full.
+    """
+    with ExitStack() as last:
+        for file in reversed(files):
+            last.callback(file.write, file.path)
+        if json:
+            print_json(content)
+        else:
+            show()
+    for file in () if json else files:
+        typer.echo(f"{file.what}: {file.path}")
 
 
 def check_writable(path: Path, what: str) -> None:
@@ -38,3 +69,17 @@ def check_model_file(path: Path) -> None:
     if path.suffix not in (".yaml", ".yml"):
         raise HannesError(f"--out {path}: a model file ends in .yaml.")
     check_writable(path, "The model file")
+
+
+def check_files(report: Path | None, model_file: Path | None = None) -> None:
+    """Refuse files that cannot be written, before the work begins."""
+    if report is not None:
+        from .pictures import ENDINGS
+
+        if report.suffix.lower() not in ("", ".html", ".htm", *ENDINGS):
+            raise HannesError(
+                f"The report {report} must end in .html, or for a picture in {', '.join(ENDINGS)}."
+            )
+        check_writable(report, "The report")
+    if model_file is not None:
+        check_model_file(model_file)

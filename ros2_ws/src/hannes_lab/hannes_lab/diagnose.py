@@ -47,6 +47,7 @@ from .fit import Fit
 from .greedy import OF_NOMINAL
 from .intervals import intervals_of, strain, sway, wider
 from .prepare import Prepared
+from .provenance import falls_made, made_from
 from .screen import usable_effects
 from .search import FAR, PENALTY, Candidate, Progress, Search, silent
 from .twins import twins
@@ -204,7 +205,7 @@ def diagnose(
         simulations=prepared.problem.simulations,
         data=data_used(prepared.features),
         given=prepared.model,
-        model=fitted_model(prepared.model, search, best, intervals),
+        model=fitted_model(prepared, search, best, intervals, falls),
         values=best.fit.values,
         nominal=answer.null.fit.values,
         unknown_kind=kind,
@@ -442,9 +443,14 @@ def spans_of(
 
 
 def fitted_model(
-    model: Model, search: Search, best: Candidate, intervals: Mapping[str, tuple[float, float]]
+    prepared: Prepared,
+    search: Search,
+    best: Candidate,
+    intervals: Mapping[str, tuple[float, float]],
+    falls: Sequence[Fall],
 ) -> Model:
-    """The model with fitted nuisance parameters and effects, as it goes into a file, and the effects' intervals."""
+    """The model with fitted nuisance parameters and effects, as it goes into a file, with what it was made from."""
+    model = prepared.model
     values, names = best.fit.values, model.names
     known = {n: v for n, v in values.items() if "@" not in n and n in names}
     out = model.with_values(known, status="identified", source=FITTED)
@@ -454,7 +460,8 @@ def fitted_model(
         n: [float(f"{end:.5g}") for end in intervals[n]] for n in values if n.split(".")[0] in best.names
     }
     provenance = {**model.provenance, "intervals_95": spans} if spans else model.provenance
-    return replace(out, plant=model.plant, provenance=provenance)
+    out = replace(out, plant=model.plant, provenance=provenance)
+    return made_from(out, model, prepared.features, falls=falls_made(falls))
 
 
 def _entry(search: Search, name: str, values: Mapping[str, float]) -> EffectEntry:

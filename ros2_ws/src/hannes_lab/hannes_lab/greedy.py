@@ -196,7 +196,7 @@ def _judge(
     if not alike:
         return _Judged(judged[0], float("nan"), (), 1.0 - gain)
     for candidate in judged:
-        search.found[candidate.key] = candidate
+        search.keep(candidate)
     winner = min(alike, key=lambda k: (len(judged[k].fit.coordinates), scores[k]))
     joins = [error <= math.sqrt(part) * before for error, part in zip(held, most, strict=True)]
     others = [

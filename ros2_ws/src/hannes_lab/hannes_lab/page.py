@@ -26,7 +26,19 @@ import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 
-from .cli import _JOBS, Bags, Greedy, Jobs, MaxEffects, ModelFile, Objects, RigFile, Scale, Signals, Topics
+from .cli_options import (
+    JOBS,
+    Bags,
+    Greedy,
+    Jobs,
+    MaxEffects,
+    ModelFile,
+    Objects,
+    RigFile,
+    Scale,
+    Signals,
+    Topics,
+)
 from .page_guard import Guard, address_of
 from .page_worker import ANSWER, GRACE_S, MODEL, REPORT
 from .prepare import existing
@@ -321,7 +333,7 @@ def _clock(seconds: float) -> str:
 # -- the command ----------------------------------------------------------------------------------------------------
 def page(
     bags: Bags,
-    model: ModelFile = "nominal",
+    model: ModelFile = None,
     objects: Objects = None,
     scale: Scale = None,
     topics: Topics = None,
@@ -329,7 +341,7 @@ def page(
     rig: RigFile = None,
     max_effects: MaxEffects = None,
     greedy: Greedy = None,
-    jobs: Jobs = _JOBS,
+    jobs: Jobs = JOBS,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port; 0: any that is free.")] = 0,
     host: Annotated[
         str, typer.Option("--host", help="Address to listen at; any but 127.0.0.1 opens the page to others.")
@@ -339,7 +351,7 @@ def page(
     """Compare, diagnose and add in a web page of this machine."""
     for bag in bags:
         existing(bag)
-    if rig is None:
+    if model is not None:
         Model.load(model)  # so that a wrong name is said here, not on the page
     settings: dict[str, Any] = {"bags": [str(b) for b in bags], "model": model, "rig": rig, "jobs": jobs}
     settings |= {"objects": objects, "scale": scale, "topics": topics, "signals": signals}

@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +22,14 @@ from hannes_description.errors import HannesError
 from hannes_description.output import finite
 from hannes_sim.effect import catalogue
 
-from .add import Addition, add_effects, with_provenance
-from .cli import _after, _before, _check_effects, _executor, _prepared
+from .add import Addition, add_effects
 from .compare import compare
 from .diagnose import diagnose, effect_sources
 from .diagnosis import Diagnosis
 from .features import data_used
+from .provenance import save_model
 from .report import verdict_of, write_report
+from .session import after, before, executor_of, prepared_from, try_effects
 
 Say = Callable[[Mapping[str, Any]], None]
 
@@ -112,7 +112,7 @@ def work(task: Mapping[str, Any], folder: Path, say: Say) -> None:
     objects, signals, rig, scale, topics = (
         task.get(k) for k in ("objects", "signals", "rig", "scale", "topics")
     )
-    prepared = _prepared(task["bags"], task["model"], objects, signals, rig, scale, task["jobs"], topics)
+    prepared = prepared_from(task["bags"], task["model"], objects, signals, rig, scale, task["jobs"], topics)
     progress(1, 1, "reading the bags")
     notes = list(prepared.notes)
     say({"kind": "data", "data": data_used(prepared.features), "notes": notes, "model": prepared.model.name})
@@ -120,21 +120,22 @@ def work(task: Mapping[str, Any], folder: Path, say: Say) -> None:
         return
     found: Diagnosis | Addition | None = None
     if action != "compare":
-        _check_effects(prepared, wanted)
-        with _executor(task["jobs"], None, False) as executor:
+        try_effects(prepared, wanted)
+        with executor_of(task["jobs"]) as executor:
             found = _find(task, prepared, executor, progress)
-    before = _before(prepared, found) if found else compare(prepared)
-    comparison = finite(before.to_dict())
-    after = finite(_after(prepared, found).to_dict()) if found else None
+    comparison = finite((before(prepared, found) if found else compare(prepared)).to_dict())
     answer = finite(found.to_dict()) if found else comparison
-    shown: dict[str, Any] = {"comparison": comparison, "after": after, "diagnosis": answer if found else None}
+    shown: dict[str, Any] = {
+        "comparison": comparison,
+        "after": finite(after(prepared, found).to_dict()) if found else None,
+        "diagnosis": answer if found else None,
+    }
     command = command_line(task)
     files = [REPORT, ANSWER]
     write_report(folder / REPORT, **shown, title="Hannes: model against measurement", command=command)
     (folder / ANSWER).write_text(json.dumps(answer, indent=2), encoding="utf-8")
     if found and found.effects:
-        model = replace(found.model, name=Path(MODEL).stem)
-        with_provenance(model, prepared, found.falls, command).save(folder / MODEL)
+        save_model(found.model, folder / MODEL, command)
         files.append(MODEL)
     verdict = verdict_of(**shown)
     effects = [e.source or e.name for e in found.effects] if found else []
@@ -174,7 +175,7 @@ def command_line(task: Mapping[str, Any]) -> str:
     for name, option in FIT.items():
         given = task.get(name) or ()
         for value in [given] if isinstance(given, str) else given:
-            words += [] if (name, value) == ("model", "nominal") else [f"--{option}", value]
+            words += [f"--{option}", value]
     for effect in task.get("effects") or () if action != "compare" else ():
         words += ["--only" if task.get("only") and action == "diagnose" else "--effect", effect]
     if action == "diagnose":

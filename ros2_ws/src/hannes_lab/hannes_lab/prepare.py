@@ -162,7 +162,7 @@ def prepare(
     trials: Sequence[Trial],
     model: Model,
     *,
-    rig: Rig | type[PlantRig] | None = None,
+    rig: type[PlantRig] | None = None,
     signals: Sequence[str] | None = None,
     surrogate: bool = False,
     threads: int = 1,
@@ -170,41 +170,39 @@ def prepare(
 ) -> Prepared:
     """Estimate noise and scatter at the fitted nominal model.
 
-    rig      another machine's rig, or its class; the hand's if None
+    rig      the class of another machine's rig; the hand's if None
     signals  which signals take part; all that are there if None
     surrogate  search a slow plant through a fast one (surrogate.py); `rig` of the result is the exact one
     threads  among which the slow plant's simulations are divided while this process works alone
     typical  closures far from the others are left out already
     """
     if rig is not None:
-        checked = check_trials(trials, (rig if isinstance(rig, type) else type(rig)).__name__)
+        checked = check_trials(trials, rig.__name__)
         trials = [trial.aligned() for trial in join_trials(checked)]
     if not typical:
         trials = [without_outliers(trial) for trial in trials]
-    hand = rig is None
-    rig = rig(trials) if isinstance(rig, type) else rig or HandRig(trials)
-    check_parameters(rig, model)
-    if isinstance(rig, PlantRig):
-        check_own_code(rig, model)
-    if hand:
+    made: PlantRig = (rig or HandRig)(trials)
+    check_parameters(made, model)
+    check_own_code(made, model)
+    if rig is None:
         trials = with_seen_objects(with_one_clock(trials, model), model)
-        rig = HandRig(trials)
-    told = [] if isinstance(rig, HandRig) else check_rig(rig, model)
-    features = build_features(trials, _present(trials, signals), rig.points, rig.finest, rig.same)
-    nuisances = tuple(rig.nuisances(model))
+        made = HandRig(trials)
+    told = [] if isinstance(made, HandRig) else check_rig(made, model)
+    features = build_features(trials, _present(trials, signals), made.points, made.finest, made.same)
+    nuisances = tuple(made.nuisances(model))
     coordinates = [nuisance_coordinate(n) for n in nuisances]
-    view = rig_for(rig, model, coordinates, threads) if surrogate else rig
+    view = rig_for(made, model, coordinates, threads) if surrogate else made
     problem = build_problem(view, features, model, nuisances, {})
     found = fit(problem, model, coordinates, {}, evaluations=15)
     # Near is enough for the noise; the search fits the model as it is again, to the end.
     settled, found = settle(problem, found, moves=3)
     problem = build_problem(settled.rig, features, model, nuisances, found.values, problem.counts)
-    if isinstance(rig, HandRig):
+    if isinstance(made, HandRig):
         of_plant = other_plant(trials, model)
     else:
-        of_plant = [*told, *other_units(rig, model, features), *_nominal_of_another(model)]
-    notes = (*notes_of(trials), *of_plant, *_what_is_missing(trials, features, rig))
-    return Prepared(rig, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))
+        of_plant = [*told, *other_units(made, model, features), *_nominal_of_another(model)]
+    notes = (*notes_of(trials), *of_plant, *_what_is_missing(trials, features, made))
+    return Prepared(made, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))
 
 
 def _present(trials: Sequence[Trial], signals: Sequence[str] | None) -> list[str]:

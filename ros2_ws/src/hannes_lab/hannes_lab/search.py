@@ -220,7 +220,7 @@ class Search:
     def add(self, base: Candidate, name: str) -> Candidate:
         """Fit the base set plus one effect, from the best points of the scan."""
         found: Candidate = self.once(Search._add, base, name, text=f"fit with {name}")
-        return self._known(found)
+        return self.keep(found)
 
     def _add(self, base: Candidate, name: str) -> Candidate:
         starts = [start for _, start in self._scanned(base, name)]
@@ -371,7 +371,8 @@ class Search:
             return settle(self.problem, found, afresh=True)[1]
         return settle(self.problem, found, moves=2)[1]
 
-    def _known(self, candidate: Candidate) -> Candidate:
+    def keep(self, candidate: Candidate) -> Candidate:
+        """The candidate, which is what is known of its set from now on, unless a better fit is known."""
         known = self.found.get(candidate.key)
         if candidate.fit.complete and (known is None or candidate.penalised <= known.penalised):
             self.found[candidate.key] = candidate
@@ -384,7 +385,7 @@ class Search:
     def polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
         """Refit from the candidate's point with all derivatives taken afresh."""
         found: Candidate = self.once(Search._polish, candidate, evaluations, text="polish")
-        return self._known(found)
+        return self.keep(found)
 
     def _polish(self, candidate: Candidate, evaluations: int = 15) -> Candidate:
         new = self._led_back(self._again(candidate.fit, evaluations))
@@ -446,7 +447,7 @@ class Search:
     def with_spread(self, candidate: Candidate) -> Candidate:
         """The candidate with the derivatives from which its intervals are made."""
         found: Candidate = self.once(Search._with_spread, candidate, text="intervals")
-        return self._known(found)
+        return self.keep(found)
 
     def _with_spread(self, candidate: Candidate) -> Candidate:
         problem = self.problem.with_rig(slopes_at(self.problem.rig, candidate.fit))
@@ -472,7 +473,7 @@ class Search:
 
     def on(self, problem: Problem, nuisances: Sequence[Nuisance]) -> Search:
         """The same search on another problem; nothing that was found holds for it."""
-        return self._emptied(problem=problem, nuisances=nuisances)
+        return self._emptied(problem=problem, nuisances=nuisances, before=None)
 
     def _emptied(self, **changes: Any) -> Search:
         return replace(self, found={}, _nominal={}, _minima={}, _scans={}, _key="", **changes)
@@ -481,7 +482,7 @@ class Search:
         """Fit a set of effects from one point (z by name)."""
         model, coordinates = self.with_effects(names)
         found = fit(self.problem, model, coordinates, start, evaluations=WHOLE)
-        return self._known(_candidate(names, found))
+        return self.keep(_candidate(names, found))
 
     def _refit(self, candidate: Candidate, evaluations: int = 8) -> Candidate:
         """A candidate of another problem (other noise), fitted in this one from its point."""
@@ -495,7 +496,7 @@ class Search:
 
     def _better_known(self, candidate: Candidate) -> Candidate:
         known = self.found.get(candidate.key)
-        return known if known is not None and known.fit.cost <= candidate.fit.cost else self._known(candidate)
+        return known if known is not None and known.fit.cost <= candidate.fit.cost else self.keep(candidate)
 
     def _part(self, larger: Fit, names: Names) -> Fit:
         """Where a fit of a larger set ended, without the other effects."""
@@ -524,7 +525,7 @@ class Search:
         """Candidates of another problem, each fitted in this one unless it was already."""
         todo = [c for c in candidates if self.found.get(c.key) is not c]
         done = iter(self.each(Search._refit, [(c, 8) for c in todo], "noise afresh: refit"))
-        return [self._known(next(done) if c in todo else c) for c in candidates]
+        return [self.keep(next(done) if c in todo else c) for c in candidates]
 
     # -- rounds -------------------------------------------------------------------------------------------------
     def extend(
@@ -558,7 +559,7 @@ class Search:
             if self._worth_an_approach(k, base, starts[0][0], least, worth)
         ]
         ended, others = self._refits(chosen, text, worth)
-        fitted = [self._known(c) for c in (*ended, *others)]
+        fitted = [self.keep(c) for c in (*ended, *others)]
         best = [self.found.get(c.key, c) for c in fitted]
         # What was known before was polished where that was worth it.
         done = {c.key for c, known in zip(fitted, best, strict=True) if c is not known}
@@ -595,7 +596,7 @@ class Search:
     def polished(self, ranked: Sequence[Candidate], some: Sequence[Candidate], text: str) -> list[Candidate]:
         """The candidates, of which some are fitted with all derivatives afresh; sorted by penalised cost."""
         polished = self.each(Search._polish, [(c,) for c in some], f"{text}: polish")
-        better = {c.names: self._known(c) for c in polished}
+        better = {c.names: self.keep(c) for c in polished}
         return sorted((better.get(c.names, c) for c in ranked), key=lambda c: c.penalised)
 
     def _refits(
@@ -724,7 +725,7 @@ class Search:
 
     @property
     def _shared(self) -> tuple[Any, ...]:
-        """What the result of every item depends on."""
+        """What the result of every item depends on, beside the other minima of the model as it is."""
         sources = dict(self.sources)
         return (self.problem, self.model, tuple(self.nuisances), sources, self.thorough)
 
@@ -737,8 +738,9 @@ class Search:
         out = {}
         with suppress(NotPlain):
             self._key = self._key or content_hash(code_hash(), *self._shared)
+            minima = content_hash(sorted(self._minima.items()))
             for k, item in enumerate(items):
-                out[k] = content_hash(self._key, function.__module__, function.__qualname__, item)
+                out[k] = content_hash(self._key, minima, function.__module__, function.__qualname__, item)
         return out
 
     def _stored(self, store: Store, key: str) -> Any | None:

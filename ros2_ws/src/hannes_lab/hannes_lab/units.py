@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from hannes_bags.recording import Recording
+from hannes_bags.recording import LOOKS_LIKE, Recording
 from hannes_description.errors import HannesError
 from hannes_description.joints import RAD_PER_COUNT
 from hannes_description.signals import SIGNALS
@@ -154,7 +154,7 @@ def _recording(recording: Recording, one: _One) -> Recording:
         if name in one.samples
     }
     # The reader's guesses at units give way to what was done.
-    read = [w for w in recording.warnings if "which looks like" not in w]
+    read = [w for w in recording.warnings if LOOKS_LIKE not in w]
     return replace(recording, channels=channels).with_metadata(warnings=[*read, *one.notes])
 
 

@@ -8,7 +8,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -211,11 +210,12 @@ def _hand_images(graph: dict[str, Recording], say: Callable[[str], None]) -> dic
 
 def _lab(bags: Path, out: Path, jobs: int, say: Callable[[str], None]) -> dict[str, Any]:
     """Compare, diagnose, add, report."""
-    from hannes_lab.add import with_provenance
     from hannes_lab.compare import compare
     from hannes_lab.diagnose import diagnose, effect_sources
     from hannes_lab.prepare import load_trials, prepare
+    from hannes_lab.provenance import save_model
     from hannes_lab.report import write_report
+    from hannes_lab.session import after as compare_after
 
     trials = load_trials([bags])
     say(f"lab: {sum(len(t.closures) for t in trials)} recorded closures in {len(trials)} bags from {bags}")
@@ -236,9 +236,9 @@ def _lab(bags: Path, out: Path, jobs: int, say: Callable[[str], None]) -> dict[s
     for fall in found.falls:
         say(f"    {fall.added:<24} held-out error {fall.held_out:6.2f} times the repeatability")
     command = f"hannes report {bags}"
-    model = with_provenance(replace(found.model, name="my_hand"), prepared, found.falls, command)
-    path = model.save(out / "my_hand.yaml")
-    after = compare(replace(prepared, model=found.model), values=found.values)
+    path = out / "my_hand.yaml"
+    save_model(found.model, path, command)
+    after = compare_after(prepared, found)
     report = write_report(
         out / "report.html",
         comparison=before.to_dict(),

@@ -15,8 +15,8 @@ from hannes_description.output import print_json, print_table, text_console
 from hannes_description.parameters import data_path
 
 from ..cache import default_folder
-from ..cli import _Progress
 from ..cli_files import check_model_file
+from ..cli_progress import ConsoleProgress
 from ..executor import interruptible
 from . import (
     columns,
@@ -169,7 +169,7 @@ def validate(
     if calibrate and motor not in fitting.MOTORS:
         raise HannesError(f"--motor {motor}: valid are {', '.join(fitting.MOTORS)}.")
     begin = time.monotonic()
-    with _Progress(quiet=json) as progress:
+    with ConsoleProgress(quiet=json) as progress:
         if laws:
             written = hypotheses.write(starts=starts, cache=default_folder("calibrate"), progress=progress)
             if not json:
