@@ -93,12 +93,52 @@ def test_what_cannot_be_told_stays_apart_and_is_told_apart(rig: type) -> None:
 
 
 def test_why_files_of_one_condition_are_not_taken_together_is_said(rig: type) -> None:
-    one, two = moves(rig, "x", 0.05, 0.0, 2, fresh=True)
-    time, force = two.signals["drive_force"]
-    other = replace(two, signals={**two.signals, "drive_force": (time, force + 0.2 * np.ptp(force))})
-    notes = prepared(rig, one, other).notes
-    assert any("drive_force differs by 20 % of its span, where repeats may by 10 %" in note for note in notes)
+    one, two, three = moves(rig, "x", 0.05, 0.0, 3, fresh=True)
+
+    def pushed(trial: Trial, part: float) -> Trial:
+        time, force = trial.signals["drive_force"]
+        return replace(trial, signals={**trial.signals, "drive_force": (time, force + part * np.ptp(force))})
+
+    notes = prepared(rig, one, two, pushed(three, 0.3)).notes
+    assert any(
+        "drive_force differs by 30 % of its span, where repeats may by 20 %" in note and "(x0, x2)" in note
+        for note in notes
+    )
     assert not any("fresh=True" in note for note in notes)
+    found = prepared(rig, one, pushed(two, 0.15))
+    assert len(found.features.trials) == 1, "an adapter is believed, and what scatters is said"
+    assert any(
+        "x0: drive_force differs by 15 % of its span from recording to recording" in n for n in found.notes
+    )
+    assert not any("differs by" in note for note in prepared(rig, one, two, three).notes)
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"options": {"load": 2.0}}, "their options differ (load)"),
+        ({"units": {"drive_force": "N", "encoder_position": "rad"}}, "the units of encoder_position differ"),
+        ({"fresh": False}, "one of them begins as the first does (fresh=True), the other does not"),
+        ({"reference": 1.1}, "their references differ by up to 10.0 % of their span"),
+    ],
+)
+def test_what_differs_between_files_of_one_condition_is_named(rig: type, changed: dict, why: str) -> None:
+    one, two = moves(rig, "x", 0.05, 0.0, 2, fresh=True)
+    if "reference" in changed:
+        changed = {"reference": changed["reference"] * two.reference}
+    said = [n for n in join_trials([one, replace(two, **changed)])[0].notes if "not taken together" in n]
+    assert said == [f"x0, x1 are of one condition, 'x', and are not taken together: {why} (x0, x1)"]
+
+
+def test_samples_that_begin_late_are_not_mixed_with_the_end_of_the_file_before(rig: type) -> None:
+    """A logger's first sample comes a moment after the begin: until then the signal stands."""
+    files = [
+        replace(t, signals={name: (time[2:], values[2:]) for name, (time, values) in t.signals.items()})
+        for t in moves(rig, "step", 0.05, 0.04, 3, fresh=True)
+    ]
+    (position,) = (b for b in prepared(rig, *files).features.blocks if b.signal == "encoder_position")
+    assert np.ptp(position.measured) > 0.04
+    assert position.measured.std(axis=0).max() < 2e-6 and np.abs(position.measured[:, 0]).max() < 2e-6
 
 
 def test_noise_of_the_samples_does_not_keep_files_apart(rig: type) -> None:

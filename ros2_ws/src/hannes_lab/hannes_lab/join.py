@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from .features import stands_for_all
-from .trials import OfAll, Part, Trial, group_closures, stem_of
+from .trials import OfAll, Part, Trial, curves_of, group_closures, stem_of
 
 Array = NDArray[np.float64]
 
@@ -23,6 +24,9 @@ ENOUGH = 5
 ALIKE = 0.1
 """Root mean square difference of two mean closures, in spans of the larger, up to which they may repeat each other:
 another object or speed differs by more, the scatter of a hand by less."""
+
+SAID = 0.2
+"""The same of recordings of which an adapter says that they are of one condition."""
 
 CHANCE = 1e-3
 LARGE = 1e-3
@@ -54,16 +58,16 @@ class Loaded:
         return self.condition or re.sub(r"[\d\W_]+$", "", self.trial.name)
 
 
-def join_repeats(loaded: Sequence[Loaded]) -> list[Trial]:
+def join_repeats(loaded: Sequence[Loaded], alike: float = ALIKE) -> list[Trial]:
     """The trials in their order, those that repeat the condition of an earlier one joined to it.
 
     Recordings are joined where each has fewer than ENOUGH closures, all of one condition, and they have the same kind,
-    signals, units and description (object, logger, pose), the same reference, and mean closures that are ALIKE.  What
+    signals, units and description (object, logger, pose), the same reference, and mean closures that are `alike`.  What
     is joined already stays as it is.  Whether each begins anew is said by the trials (`fresh`), or seen.
     """
     groups: list[list[Loaded]] = []
     for one in loaded:
-        group = next((g for g in groups if _one_object([*g, one]) and _repeats(one, g[0])), None)
+        group = next((g for g in groups if _one_object([*g, one]) and not _unlike(g[0], one, alike)), None)
         if group is None:
             groups.append([one])
         else:
@@ -75,17 +79,19 @@ def join_repeats(loaded: Sequence[Loaded]) -> list[Trial]:
 
 def join_trials(trials: Sequence[Trial]) -> list[Trial]:
     """A rig's trials, joined as bags are: those that repeat a condition have its name in common."""
-    joined = join_repeats([Loaded(trial, trial.conditions[0]) for trial in trials])
+    loaded = [Loaded(trial, trial.conditions[0]) for trial in trials]
+    joined = join_repeats(loaded, SAID)
     apart: dict[str, list[Trial]] = {}
     for trial in joined:
         if len(trial.conditions) == 1 and len(trial.closures) < ENOUGH:
             apart.setdefault(trial.conditions[0], []).append(trial)
     said = [
         f"{', '.join(t.name for t in of_one)} are of one condition, '{condition}', and are not taken together: "
-        f"{_why_apart(*of_one[:2])}"
+        f"{_why_apart([one for one in loaded if one.condition == condition])}"
         for condition, of_one in apart.items()
         if len(of_one) > 1
     ]
+    said += _scattered(joined)
     said += _with_others(joined)
     first, *others = joined
     told = tuple(OfAll(note) for note in said if note not in first.notes)
@@ -114,22 +120,36 @@ def _with_others(trials: Sequence[Trial]) -> list[str]:
     ]
 
 
-def _why_apart(a: Trial, b: Trial) -> str:
-    """Why two recordings of one condition do not repeat each other."""
-    if set(a.signals) == set(b.signals):
-        far = {signal: _apart(a, b, signal) for signal in a.signals}
-        signal = max(far, key=lambda name: far[name])
-        if far[signal] > ALIKE:
-            return (
-                f"{signal} differs by {100 * far[signal]:.0f} % of its span, where repeats may by {100 * ALIKE:.0f} %; "
-                "name what differs as a condition of its own, or leave one out"
-            )
-    if a.fresh and b.fresh:
-        return "their references, signals, units or options differ"
-    return (
-        "their references or signals differ, or it is not seen how each began; where each begins as the first does, "
-        "their trials must say so (fresh=True)"
-    )
+def _why_apart(loaded: Sequence[Loaded]) -> str:
+    """Why recordings of one condition do not repeat each other."""
+    first = loaded[0]
+    for other in loaded[1:]:
+        if unlike := _unlike(first, other, SAID):
+            return f"{unlike} ({first.trial.name}, {other.trial.name})"
+    if first.trial.fresh:
+        apart = _joined(loaded, fresh=True).apart
+        return (
+            f"their references differ by {100 * apart:.1f} % of their span, so that none can be simulated for the "
+            "others; record the same one, or name each as a condition of its own"
+        )
+    return "it is not seen how each began; where each begins as the first does, their trials must say so (fresh=True)"
+
+
+def _scattered(trials: Sequence[Trial]) -> list[str]:
+    """A sentence on recordings that are taken together as the adapter says, though they differ by more than ALIKE."""
+    out = []
+    for trial in (t for t in trials if t.parts):
+        for signal, (time, values) in trial.signals.items():
+            curves = curves_of(trial.closures, time, values)
+            noise = sample_noise(values)
+            apart = math.sqrt(max(2.0 * float(curves.var(axis=0, ddof=1).mean()) - 2.0 * noise**2, 0.0))
+            part = apart / (float(np.ptp(curves.mean(axis=0))) or math.inf)
+            if part > ALIKE and not _noise(trial, signal):
+                out.append(
+                    f"{trial.name}: {signal} differs by {100 * part:.0f} % of its span from recording to recording; if "
+                    "that has a cause, name what differs as a condition of its own"
+                )
+    return out
 
 
 def _one_or_all(group: list[Loaded], fresh: bool | None) -> list[Trial]:
@@ -200,21 +220,54 @@ def _one_object(group: Sequence[Loaded]) -> bool:
     return all(one == said[0] for one in said)
 
 
-def _repeats(one: Loaded, other: Loaded) -> bool:
+def _unlike(one: Loaded, other: Loaded, alike: float) -> str:
+    """Why two recordings do not repeat each other; empty if they do.
+
+    alike  most that mean closures may differ by, see ALIKE
+    """
     a, b = one.trial, other.trial
-    if any(len(t.conditions) != 1 or len(t.closures) >= ENOUGH or t.parts for t in (a, b)):
-        return False
-    options = [{k: v for k, v in t.options.items() if k != "object"} for t in (a, b)]
-    said = (one.kind, a.period, a.units, set(a.signals), a.fresh)
-    if said != (other.kind, b.period, b.units, set(b.signals), b.fresh) or not _same(*options):
-        return False
-    together = _joined([other, one])
-    return len(together.conditions) == 1 and all(_apart(a, b, s) <= ALIKE for s in a.signals)
+    for trial in (a, b):
+        if len(trial.conditions) != 1 or len(trial.closures) >= ENOUGH or trial.parts:
+            return f"{trial.name} has several conditions, or closures enough"
+    if one.kind != other.kind:
+        return "they are of different conditions"
+    if a.period != b.period:
+        return f"the control period of one is {a.period:g} s, of the other {b.period:g} s"
+    if a.fresh != b.fresh:
+        return "one of them begins as the first does (fresh=True), the other does not"
+    if set(a.signals) != set(b.signals):
+        return f"{', '.join(sorted(set(a.signals) ^ set(b.signals)))}: a signal of one of them only"
+    units = [name for name in a.signals if a.unit(name) != b.unit(name)]
+    if units:
+        return f"the units of {', '.join(units)} differ"
+    options = _differing(*({k: v for k, v in t.options.items() if k != "object"} for t in (a, b)))
+    if options:
+        return f"their options differ ({', '.join(options)})"
+    if len(_joined([one, other]).conditions) != 1:
+        return f"their references differ{_by(a, b)}"
+    far = {signal: _apart(a, b, signal) for signal in a.signals}
+    signal = max(far, key=lambda name: far[name])
+    if far[signal] <= alike:
+        return ""
+    return (
+        f"{signal} differs by {100 * far[signal]:.0f} % of its span, where repeats may by {100 * alike:.0f} %; "
+        "name what differs as a condition of its own, or leave one out"
+    )
 
 
-def _same(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    """Whether two descriptions are equal; a rig's may hold arrays."""
-    return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
+def _by(a: Trial, b: Trial) -> str:
+    """How much two references differ, in words."""
+    shapes = [t.reference[round(t.closures[0].start / t.period) :] for t in (a, b)]
+    n = min(shape.size for shape in shapes)
+    span = float(np.ptp(shapes[0])) or 1.0
+    return (
+        f" by up to {100 * float(np.max(np.abs(shapes[0][:n] - shapes[1][:n]))) / span:.1f} % of their span"
+    )
+
+
+def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
+    """Names of what two descriptions do not share; a rig's may hold arrays."""
+    return sorted(k for k in a.keys() | b.keys() if not (k in a and k in b and np.array_equal(a[k], b[k])))
 
 
 def _apart(a: Trial, b: Trial, signal: str) -> float:
@@ -250,10 +303,9 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
     ]
     signals = {}
     for name in first.signals:
-        inside = [_inside(t, name, k == 0, k == len(trials) - 1) for k, t in enumerate(trials)]
-        time = [t.signals[name][0][i] + b for t, i, b in zip(trials, inside, begins, strict=True)]
-        values = [t.signals[name][1][i] for t, i in zip(trials, inside, strict=True)]
-        signals[name] = np.concatenate(time), np.concatenate(values)
+        own = [_own(t, name, k == 0, k == len(trials) - 1) for k, t in enumerate(trials)]
+        time = [times + begin for (times, _), begin in zip(own, begins, strict=True)]
+        signals[name] = np.concatenate(time), np.concatenate([values for _, values in own])
     step = max(one.step for one in group)
     names = [stem_of(t.source) if t.source else t.name for t in trials]
     if len(set(names)) < len(names):  # several in one file
@@ -281,12 +333,22 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
     )
 
 
-def _inside(trial: Trial, name: str, first: bool, last: bool) -> NDArray[np.bool_]:
-    """The samples of a signal that lie in no other recording once this one stands between two."""
-    time = trial.signals[name][0]
+def _own(trial: Trial, name: str, first: bool, last: bool) -> tuple[Array, Array]:
+    """The samples of a signal that lie in no other recording once this one stands between two.
+
+    Before its first sample and after its last one a signal stands, as in a recording that is alone: what is between
+    two samples is a line, which must not go from the end of one recording to the begin of the next.
+    """
+    time, values = trial.signals[name]
     until = trial.reference.size * trial.period
     inside: NDArray[np.bool_] = (first | (time >= 0.0)) & (last | (time < until))
-    return inside
+    time, values = time[inside], values[inside]
+    ends = until - 1e-3 * trial.period
+    if not first and time[0] > 0.0:
+        time, values = np.append(0.0, time), np.append(values[0], values)
+    if not last and time[-1] < ends:
+        time, values = np.append(time, ends), np.append(values, values[-1])
+    return time, values
 
 
 def _notes(trials: Sequence[Trial], names: Sequence[str]) -> list[str]:
