@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from .repeats import end_of
 from .rig import Rig
-from .trials import SAME, Trial
+from .trials import SAME, Closure, Trial
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -374,6 +374,9 @@ def _block(
             if not inside.all():
                 continue
             right = np.clip(right, 1, time.size - 1)
+        first, last = _own_samples(trial, closure, time)
+        if first < last:  # no line goes from the end of one recording to the begin of the next
+            right = np.clip(right, first + 1, last)
         left = right - 1
         weight = np.clip((at - time[left]) / np.maximum(time[right] - time[left], 1e-12), 0.0, 1.0)
         measured.append(values[left] * (1.0 - weight) + values[right] * weight)
@@ -406,6 +409,15 @@ def _block(
         trial.unit(signal),
         finest,
     )
+
+
+def _own_samples(trial: Trial, closure: Closure, time: Array) -> tuple[int, int]:
+    """Numbers of the first and the last sample of the recording that a closure of a joined trial is of."""
+    begins = np.array([part.begin for part in trial.parts]) - 1e-9
+    part = int(np.searchsorted(begins, 0.5 * (closure.start + closure.stop), side="right")) - 1
+    first = int(np.searchsorted(time, begins[part])) if part > 0 else 0
+    last = int(np.searchsorted(time, begins[part + 1])) if part + 1 < begins.size else time.size
+    return first, last - 1
 
 
 def _each(texts: Iterable[str]) -> str:

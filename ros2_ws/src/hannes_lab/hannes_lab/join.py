@@ -303,9 +303,10 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
     ]
     signals = {}
     for name in first.signals:
-        own = [_own(t, name, k == 0, k == len(trials) - 1) for k, t in enumerate(trials)]
-        time = [times + begin for (times, _), begin in zip(own, begins, strict=True)]
-        signals[name] = np.concatenate(time), np.concatenate([values for _, values in own])
+        inside = [_inside(t, name, k == 0, k == len(trials) - 1) for k, t in enumerate(trials)]
+        time = [t.signals[name][0][i] + b for t, i, b in zip(trials, inside, begins, strict=True)]
+        values = [t.signals[name][1][i] for t, i in zip(trials, inside, strict=True)]
+        signals[name] = np.concatenate(time), np.concatenate(values)
     step = max(one.step for one in group)
     names = [stem_of(t.source) if t.source else t.name for t in trials]
     if len(set(names)) < len(names):  # several in one file
@@ -333,22 +334,12 @@ def _joined(group: Sequence[Loaded], fresh: bool = False) -> Trial:
     )
 
 
-def _own(trial: Trial, name: str, first: bool, last: bool) -> tuple[Array, Array]:
-    """The samples of a signal that lie in no other recording once this one stands between two.
-
-    Before its first sample and after its last one a signal stands, as in a recording that is alone: what is between
-    two samples is a line, which must not go from the end of one recording to the begin of the next.
-    """
-    time, values = trial.signals[name]
+def _inside(trial: Trial, name: str, first: bool, last: bool) -> NDArray[np.bool_]:
+    """The samples of a signal that lie in no other recording once this one stands between two."""
+    time = trial.signals[name][0]
     until = trial.reference.size * trial.period
     inside: NDArray[np.bool_] = (first | (time >= 0.0)) & (last | (time < until))
-    time, values = time[inside], values[inside]
-    ends = until - 1e-3 * trial.period
-    if not first and time[0] > 0.0:
-        time, values = np.append(0.0, time), np.append(values[0], values)
-    if not last and time[-1] < ends:
-        time, values = np.append(time, ends), np.append(values, values[-1])
-    return time, values
+    return inside
 
 
 def _notes(trials: Sequence[Trial], names: Sequence[str]) -> list[str]:
