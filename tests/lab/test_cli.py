@@ -90,6 +90,16 @@ def test_diagnose_add_and_report(
     compared = json.loads(out)
     assert code == 0 and compared["overall"] < 1.3
     assert compared["values"]["hand.stiffness"] > 0.0
+    row = compared["nuisances"]["hand.stiffness"]
+    assert row["value"] == compared["values"]["hand.stiffness"] and row["unit"] == "N.m/rad"
+    assert abs(row["prior_sds"]) < 3.0 and row["nominal"] > 0.0
+    # the diagnosis again, from what it kept: the parameters of the hand itself stand in its text too
+    code, out, _ = hannes("diagnose", str(bags), *only, "--jobs", "1", capsys=capsys, monkeypatch=monkeypatch)
+    table = out.partition("The model's own parameters, as fitted")[2].partition("others moved less")[0]
+    rows = [line.split("│") for line in table.splitlines() if line.startswith("│")]
+    assert code == 0 and len(rows) == 10
+    farthest = [abs(float(row[5])) for row in rows]
+    assert farthest == sorted(farthest, reverse=True) and all(".." in row[3] for row in rows)
 
 
 def test_hide_keeps_the_truth_away_from_the_bags(

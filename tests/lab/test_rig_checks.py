@@ -176,6 +176,11 @@ def test_what_the_class_says_wrongly_is_refused(lab: Lab, more: str, said: str) 
     assert said in lab.refused(more=more)
 
 
+def test_a_machine_may_show_nothing_of_what_its_drive_gives(lab: Lab) -> None:
+    code, out, _ = lab(more="drive_signals = ()")
+    assert code == 0 and "no current is recorded (only encoder_position, drive_force)" in out
+
+
 def test_what_the_class_leaves_out_is_said(lab: Lab) -> None:
     code, out, _ = lab(more="sizes = {}")
     assert code == 0 and "Mine gives no `sizes`" in out and "0.05 N.m, 14.57 rad" in out

@@ -222,7 +222,9 @@ def test_a_recorded_command_is_replayed_without_a_controller(rig: type) -> None:
     command = replace(one, reference=one.signals["drive_force"][1])
     model = replace(Model.load(rig.model), controller="double_pid")  # as a model file that names none
     found = prepare([command], model, rig=Open)
-    errors = {e.signal: e.rmse for e in compare(found).errors}
+    result = compare(found)
+    assert all(o.to_dict()["reference"] is None for o in result.overlays), "it is no position"
+    errors = {e.signal: e.rmse for e in result.errors}
     assert errors["drive_force"] < 1e-9 and errors["encoder_position"] < 1e-3
     assert not any("reference, which the simulated one" in note for note in found.notes)
 

@@ -96,9 +96,10 @@ def _check_grid(rig: PlantRig, who: str) -> None:
 def _check_drive(rig: PlantRig, who: str) -> None:
     """Refuse names of drive signals that are no names, or another's misspelt."""
     names = rig.drive_signals
-    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
+    if isinstance(names, str) or not isinstance(names, Sequence):
         raise HannesError(
-            f"{who}.drive_signals is {names!r}; it takes a tuple of names, such as ('motor_current',) with its comma."
+            f"{who}.drive_signals is {names!r}; it takes a tuple of names, such as ('motor_current',) with its "
+            "comma, or () where no signal shows what the drive gives."
         )
     recorded = dict.fromkeys(s for trial in rig.trials for s in trial.signals)
     for name in names:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from hannes_description.output import TEXT_WIDTH, estimate, number, show_table, text_console, with_unit
 from rich.console import Console
@@ -56,6 +57,7 @@ def show_comparison(result: Comparison) -> None:
     show_table(table, TEXT_WIDTH)
     if result.metrics:
         console.print("Relative error: (measured - model) / measured.", style="dim")
+    _show_nuisances(result.nuisances)
     console.print("The residual depends on: " + ", ".join(d.said for d in result.depends_on))
     if math.isfinite(result.overall):
         console.print(f"Overall error: {number(result.overall)} times the repeatability between closures.")
@@ -88,6 +90,7 @@ def show_diagnosis(found: Diagnosis, machine: str) -> None:
             console.print(f"  {name} = {value}   95 %: {span}{note}")
         console.print(f"  {effect.why}")
     _show_falls(console, found, machine)
+    _show_nuisances(found.nuisances)
     if found.ranking and not has_excess(found.costs, bool(found.effects)):
         console.print("\nThere is no excess misfit that effects could explain: chance explains all of it.")
     elif found.ranking:
@@ -95,13 +98,35 @@ def show_diagnosis(found: Diagnosis, machine: str) -> None:
             "\nRanking (part of the excess misfit that each effect explains alone, at least: only the best are fitted "
             "to the end; each parameter costs):"
         )
-        for rank in found.ranking[:8]:
+        for rank in sorted(found.ranking, key=lambda rank: -rank.explained)[:8]:
             console.print(f"  {100 * rank.explained:5.1f} %  {' + '.join(rank.names)}")
     _show_experiments(console, found.experiments)
     if found.verdict == "unknown":
         console.print("\nThe rest depends on: " + ", ".join(d.said for d in found.depends_on))
     for note in found.notes:
         console.print(f"note: {note}", style="dim")
+
+
+_FARTHEST = 10
+"""Parameters of the model that are shown: those that a fit moved farthest."""
+
+
+def _show_nuisances(nuisances: Mapping[str, Mapping[str, Any]]) -> None:
+    """The model's own parameters as fitted, farthest from their nominal values first."""
+    rows = sorted(nuisances.items(), key=lambda row: -abs(row[1]["prior_sds"]))
+    if not rows:
+        return
+    table = Table(title="The model's own parameters, as fitted")
+    spans = any(math.isfinite(row["low"]) for _, row in rows)
+    for name in ("parameter", "fitted", *(["95 %"] if spans else []), "nominal", "tolerances"):
+        table.add_column(name, justify="left" if name == "parameter" else "right")
+    for name, row in rows[:_FARTHEST]:
+        fitted, span = estimate(row["value"], row["low"], row["high"], row["unit"])
+        cells = [fitted, *([span] if spans else []), number(row["nominal"]), f"{row['prior_sds']:+.1f}"]
+        table.add_row(name, *cells)
+    if len(rows) > _FARTHEST:
+        table.caption = f"the {len(rows) - _FARTHEST} others moved less; all are in --json and the report"
+    show_table(table, TEXT_WIDTH)
 
 
 def _show_experiments(console: Console, experiments: Sequence[Experiment]) -> None:

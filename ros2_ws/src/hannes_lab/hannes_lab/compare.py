@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from hannes_description.model import Model
+from hannes_sim.rollout import VoltagePlayback
 from numpy.typing import NDArray
 
 from .delays import in_time
@@ -18,6 +19,7 @@ from .depends import Dependence, residual_dependences
 from .errors import SignalError, overall, per_signal, signal_errors
 from .executor import Executor
 from .features import Block, Features, data_used
+from .fit import nuisance_table
 from .phases import METRICS, PHASES, metrics, phase_of
 from .prepare import FEW, Prepared
 from .search import Progress, Search, silent
@@ -59,7 +61,10 @@ class Cell:
 
 @dataclass(frozen=True)
 class Overlay:
-    """Mean closure of a signal with its band, the model beside it, and the phase of every instant."""
+    """Mean closure of a signal with its band, the model beside it, and the phase of every instant.
+
+    reference  of the position, in its unit; None where it is a command that is played, without a controller
+    """
 
     condition: str
     signal: str
@@ -69,7 +74,7 @@ class Overlay:
     low: Array
     high: Array
     model: Array
-    reference: Array
+    reference: Array | None
     phase: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -80,7 +85,8 @@ class Overlay:
             "phase": list(self.phase),
         }
         for name in ("time", "measured", "low", "high", "model", "reference"):
-            out[name] = [float(f"{v:.6g}") for v in getattr(self, name)]
+            values = getattr(self, name)
+            out[name] = None if values is None else [float(f"{v:.6g}") for v in values]
         return out
 
 
@@ -123,7 +129,7 @@ class Comparison:
 
     overall    root mean square of the errors in multiples of the repeatability; NaN where nothing was repeated
     by_signal  root mean square error of each signal over the conditions, in its unit
-    values     parameters that were fitted, by name, in their units
+    values     parameters that were fitted, by name, in their units; nuisances the same as fit.nuisance_table has them
     """
 
     model: Model
@@ -138,6 +144,7 @@ class Comparison:
     notes: tuple[str, ...]
     by_signal: Mapping[str, float] = field(default_factory=dict)
     values: Mapping[str, float] = field(default_factory=dict)
+    nuisances: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -146,6 +153,7 @@ class Comparison:
             "overall": self.overall,
             "by_signal": dict(self.by_signal),
             "values": dict(self.values),
+            "nuisances": {n: dict(row) for n, row in self.nuisances.items()},
             "errors": [e.to_dict() for e in self.errors],
             "cells": [c.to_dict() for c in self.cells],
             "overlays": [o.to_dict() for o in self.overlays],
@@ -172,6 +180,7 @@ def compare(
     """
     features, model = prepared.features, prepared.model
     own: list[str] = []
+    table: dict[str, dict[str, Any]] = {}
     if values is None:
         values = {}
         if not fitted:
@@ -187,6 +196,7 @@ def compare(
             )
             prepared, search = in_time(prepared, search)
             found = search.null().fit
+            table = nuisance_table(found)
             features, values, clock = prepared.features, found.values, other_clock(prepared.problem, found)
             own = [*([clock.said] if clock else []), *moved_notes(found), *held_notes(found)]
     predicted = features.closures(prepared.rig, model, values)
@@ -203,7 +213,7 @@ def compare(
         overall(errors),
         _cells(features, predicted, labels, seed, names, titles),
         tuple(
-            replace(_overlay(features, b, p, lab, names), condition=title)
+            replace(_overlay(prepared, b, p, lab, names), condition=title)
             for b, p, lab, title in zip(features.blocks, predicted, labels, titles, strict=True)
         ),
         _metrics(features, predicted, labels) if prepared.rig.figures else (),
@@ -212,6 +222,7 @@ def compare(
         (*prepared.notes, *own),
         per_signal(features, [of_blocks]),
         values if fitted else {},
+        table,
     )
 
 
@@ -321,13 +332,14 @@ def _benjamini_hochberg(p_values: list[float]) -> float:
 
 
 def _overlay(
-    features: Features, block: Block, predicted: Array, label: NDArray[np.int64], names: Sequence[str]
+    prepared: Prepared, block: Block, predicted: Array, label: NDArray[np.int64], names: Sequence[str]
 ) -> Overlay:
-    trial = features.trials[block.trial]
+    trial = prepared.features.trials[block.trial]
     closure = trial.of(block.condition)[0]
     spread = 2.0 * block.measured.std(axis=0, ddof=1) if block.n > 1 else np.zeros(block.phase.size)
     mean = block.measured.mean(axis=0)
     grid = np.arange(trial.reference.size) * trial.period
+    played = isinstance(prepared.rig.controller(prepared.model, trial.period), VoltagePlayback)
     return Overlay(
         block.condition,
         block.signal,
@@ -337,7 +349,7 @@ def _overlay(
         mean - spread,
         mean + spread,
         predicted.mean(axis=0),
-        np.interp(closure.start + block.phase, grid, trial.reference),
+        None if played else np.interp(closure.start + block.phase, grid, trial.reference),
         tuple(names[k] for k in label),
     )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from hannes_description.errors import HannesError
@@ -43,7 +42,7 @@ from .falls import (
     worth_showing,
 )
 from .features import data_used
-from .fit import Fit
+from .fit import Fit, nuisance_table
 from .greedy import OF_NOMINAL
 from .intervals import intervals_of, strain, sway, wider
 from .prepare import Prepared
@@ -193,7 +192,7 @@ def diagnose(
             "final": best.fit.cost,
             "critical": limits.misfit,
         },
-        nuisances=_nuisance_table(best.fit, intervals),
+        nuisances=nuisance_table(best.fit, intervals),
         notes=(
             *((pointer,) if pointer else ()),
             *prepared.notes,
@@ -522,18 +521,3 @@ def _missed(error: SignalError) -> str:
     """An error in its unit and, where there are repeats, in multiples of the repeatability."""
     ratio = f" ({error.ratio:.2f} times the repeatability)" if math.isfinite(error.ratio) else ""
     return f"{error.rmse:.3g} {error.unit}{ratio}"
-
-
-def _nuisance_table(found: Fit, intervals: Mapping[str, tuple[float, float]]) -> dict[str, dict[str, Any]]:
-    return {
-        c.name: {
-            "value": c.value(float(z)),
-            "nominal": c.value(0.0),
-            "prior_sds": float(z),
-            "low": intervals[c.name][0],
-            "high": intervals[c.name][1],
-            "unit": c.unit,
-        }
-        for c, z in zip(found.coordinates, found.z, strict=True)
-        if c.nuisance
-    }

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from hannes_description.model import Model
@@ -448,3 +450,18 @@ def fit(
         derivatives.forget()
     jacobian = derivatives.at(z, r)
     return Fit(model, coordinates, z, cost(r, z), r, jacobian, complete)
+
+
+def nuisance_table(
+    found: Fit, intervals: Mapping[str, tuple[float, float]] | None = None
+) -> dict[str, dict[str, Any]]:
+    """The nuisance parameters of a fit by name: value and nominal in their unit, and the difference in standard
+    deviations of the prior (`prior_sds`); with intervals their ends, else NaN."""
+    out: dict[str, dict[str, Any]] = {}
+    for c, z in zip(found.coordinates, found.z, strict=True):
+        if c.nuisance:
+            low, high = (intervals or {}).get(c.name, (math.nan, math.nan))
+            value, nominal = c.value(float(z)), c.value(0.0)
+            out[c.name] = {"value": value, "nominal": nominal, "prior_sds": float(z)}
+            out[c.name] |= {"low": low, "high": high, "unit": c.unit}
+    return out

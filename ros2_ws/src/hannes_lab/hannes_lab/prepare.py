@@ -54,7 +54,7 @@ FEW = 5
 class Prepared:
     """A data set, ready: the rig, the statistical problem and the nuisance parameters of a model."""
 
-    rig: Rig
+    rig: PlantRig
     model: Model
     features: Features
     problem: Problem
@@ -235,7 +235,7 @@ def _what_is_missing(trials: Sequence[Trial], features: Features, rig: Rig) -> l
             "there is one condition only: what fits it may fail elsewhere; record another speed, and another load"
         )
     if not any(signal in present for signal in rig.drive_signals):
-        drive = rig.drive_signals[0].removeprefix("motor_").replace("_", " ")
+        drive = (*rig.drive_signals, "motor_current")[0].removeprefix("motor_").replace("_", " ")
         only = "" if isinstance(rig, HandRig) else f" (only {', '.join(present)})"
         notes.append(
             f"no {drive} is recorded{only}: friction, torque constant and inertia are hard to tell apart"

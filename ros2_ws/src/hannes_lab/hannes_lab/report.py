@@ -147,6 +147,7 @@ def render_report(
         "next": next_step(kind, diagnosis, command),
         "fall": error_fall(diagnosis),
         "conditions": overlay_groups(comparison, after),
+        "references": any(o.get("reference") for o in _list(comparison, "overlays")),
         "repeated": any(text.known(e.get("repeatability")) is not None for e in _list(comparison, "errors")),
         "maps": failure_maps(comparison, after),
         "dependences": dependences(comparison, after, diagnosis),
@@ -639,6 +640,7 @@ def ranking(diagnosis: Part | None) -> dict[str, Any] | None:
                 "found": set(row.get("names", [])) <= found and bool(found),
             }
         )
+    out.sort(key=lambda row: -(text.known(row["explained"]) or 0.0))
     return {
         "first": out[:RANKS],
         "rest": out[RANKS:],
