@@ -109,7 +109,7 @@ class Case:
         out = []
         for name, values in self.effects:
             kind = load_effect(name)
-            out.append(kind.entry(dict(values), source=effect_source(kind, name)))
+            out.append(kind.entry(dict(values), source=effect_source(name)))
         return out
 
 

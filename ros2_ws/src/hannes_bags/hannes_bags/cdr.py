@@ -27,7 +27,6 @@ FLOAT64 = "std_msgs/msg/Float64"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
 FLOAT64_MULTI_ARRAY = "std_msgs/msg/Float64MultiArray"
-CLOCK = "rosgraph_msgs/msg/Clock"
 NUMBERS = {
     "std_msgs/msg/Float32": "<f4",
     FLOAT64: "<f8",
@@ -105,12 +104,6 @@ def decode_numbers(raw: RawTopic, msgtype: str) -> FloatArray:
     """(n,) values of messages of one of the types NUMBERS. Raises CdrError."""
     dtype = NUMBERS[msgtype]
     return _fixed(raw, dtype, np.dtype(dtype).itemsize)[:, 0].astype(np.float64)
-
-
-def decode_clock(raw: RawTopic) -> IntArray:
-    """(n,) ns of rosgraph_msgs/Clock messages. Raises CdrError."""
-    words = _fixed(raw, "<u4", 8).astype(np.int64)
-    return _stamp(words[:, 0], words[:, 1])
 
 
 def _fixed(raw: RawTopic, dtype: str, size: int) -> npt.NDArray[Any]:

@@ -12,8 +12,7 @@ The law is one pure function, called by the node and, compiled, by the simulator
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any
 
@@ -234,6 +233,3 @@ class DoublePID:
     def saving(self) -> bool:
         """True while the battery saver holds."""
         return bool(self.states[_SAVING])
-
-    def describe(self) -> Mapping[str, float]:
-        return asdict(self.settings)

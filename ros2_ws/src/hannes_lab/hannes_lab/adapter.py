@@ -50,7 +50,7 @@ OTHER_MOVE = 0.3
 """Mean difference of the references of two closures, in what they go over, from which one does not repeat the other."""
 
 
-def check_rig(rig: Rig, model: Model) -> list[str]:
+def check_rig(rig: Rig) -> list[str]:
     """Refuse what an adapter's class says wrongly, and give what it leaves out, in sentences."""
     if not isinstance(rig, PlantRig):
         return []

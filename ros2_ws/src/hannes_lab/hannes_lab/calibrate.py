@@ -126,7 +126,7 @@ def calibrate(
         recordings={n: float(f"{v:.6g}") for n, v in best.values.items() if n not in free},
     )
     notes = warnings_of(parameters, len(free), features.size)
-    notes += _notes_of_errors(errors, best, explaining(best, held, by_held))
+    notes += _notes_of_errors(errors, explaining(best, held, by_held))
     notes += [
         f"{n} is marked as fixed in the parameter file ({model.parameters[n].source}); it is free because you named it."
         for n in free
@@ -173,7 +173,7 @@ def explaining(best: Fit, held: Sequence[Coordinate], by_held: Array) -> list[st
     return [held[k].name for k in np.argsort(-gain) if gain[k] > EXPLAINS]
 
 
-def _notes_of_errors(errors: Mapping[str, float], best: Fit, held: Sequence[str]) -> list[str]:
+def _notes_of_errors(errors: Mapping[str, float], held: Sequence[str]) -> list[str]:
     """Whether the calibrated model explains the recordings, and whether it says the same of other closures.
 
     held  held parameters that would explain much of the misfit

@@ -158,9 +158,7 @@ def diagnose(
         prepared.rig.drive_signals,
     )
     pointer = pointed_at(depends_on) if verdict == "unknown" else ""
-    experiments = (
-        separating_experiments(prepared, search, [search.fit_of(n) for n in tied]) if len(tied) > 1 else ()
-    )
+    experiments = separating_experiments(prepared, [search.fit_of(n) for n in tied]) if len(tied) > 1 else ()
     return Diagnosis(
         verdict=verdict,
         summary=summary(
@@ -466,7 +464,7 @@ def fitted_model(
 def _entry(search: Search, name: str, values: Mapping[str, float]) -> EffectEntry:
     kind = search.effect(name)
     own = {p.name: values[f"{name}.{p.name}"] for p in kind.parameters}
-    source = effect_source(kind, search.sources[name])
+    source = effect_source(search.sources[name])
     return kind.entry(own, source=source, status="identified", where=FITTED)
 
 
@@ -508,7 +506,7 @@ def _found(
         else "No signal of any condition is missed by much less with it than without."
     )
     why = f"{missed} What it looks like: {kind.looks_like}." if kind.looks_like else missed
-    return FoundEffect(name, kind.title, effect_source(kind, search.sources[name]), parameters, why)
+    return FoundEffect(name, kind.title, effect_source(search.sources[name]), parameters, why)
 
 
 def _change(before: SignalError, after: SignalError) -> tuple[float, float]:

@@ -78,7 +78,7 @@ def signature(name: str, model: Model | None = None) -> Signature:
     """
     effect = load_effect(name)
     model = model or Model.load("nominal")
-    entry = effect.entry(source=effect_source(effect, name))
+    entry = effect.entry(source=effect_source(name))
     closures = CLOSURES_WITH_MEMORY if effect.memory else 1
     found = []
     for condition in SHOWN:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .prepare import Prepared
 from .problem import Coordinate, nuisance_coordinate, sample_variance
 from .rig import Rig
-from .search import Candidate, Search
+from .search import Candidate
 from .surrogate import FAST_PLANT, SLOW_PLANTS
 from .trials import Closure, Trial
 
@@ -73,7 +73,7 @@ CANDIDATES: tuple[tuple[str, str, dict[str, float], str], ...] = (
 
 
 def separating_experiments(
-    prepared: Prepared, search: Search, tied: Sequence[Candidate], keep: int = 3
+    prepared: Prepared, tied: Sequence[Candidate], keep: int = 3
 ) -> tuple[Experiment, ...]:
     """The candidate conditions that separate the tied models best.
 

@@ -187,7 +187,7 @@ def prepare(
     if rig is None:
         trials = with_seen_objects(with_one_clock(trials, model), model)
         made = HandRig(trials)
-    told = [] if isinstance(made, HandRig) else check_rig(made, model)
+    told = [] if isinstance(made, HandRig) else check_rig(made)
     features = build_features(trials, _present(trials, signals), made.points, made.finest, made.same)
     nuisances = tuple(made.nuisances(model))
     coordinates = [nuisance_coordinate(n) for n in nuisances]

@@ -113,7 +113,7 @@ def try_effects(prepared: Prepared, sources: Sequence[str]) -> None:
 
     def simulate(source: str) -> None:
         kind = prepared.rig.effect(load_effect(source))
-        entry = kind.entry({p.name: p.typical for p in kind.parameters}, source=effect_source(kind, source))
+        entry = kind.entry({p.name: p.typical for p in kind.parameters}, source=effect_source(source))
         prepared.rig.simulate(prepared.model.with_effect(entry), {}, trial, reference)
 
     check_own_effects(sources, simulate, along_reference(trial, reference))

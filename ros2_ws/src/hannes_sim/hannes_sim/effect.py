@@ -400,7 +400,7 @@ def evaluate(
     return y
 
 
-def effect_source(effect: EffectType, given: str) -> str | None:
+def effect_source(given: str) -> str | None:
     """What a model file stores so that the effect is found again.
 
     None for the catalogue, else an absolute path:Class.
@@ -418,7 +418,4 @@ def strength_of(effect: str, factor: float) -> EffectEntry:
     for p in kind.parameters:
         scale = factor if p.vanishing is not None else 1.0
         values[p.name] = min(max(p.typical * scale, p.lower), p.upper)
-    return kind.entry(values, source=effect_source(kind, effect))
-
-
-EffectFunction = Callable[[Any, Any, Any, Any], None]
+    return kind.entry(values, source=effect_source(effect))
