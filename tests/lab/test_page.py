@@ -304,7 +304,7 @@ def test_a_mistake_is_one_sentence_on_the_page(tmp_path: Path) -> None:
 
 def test_a_worker_that_dies_is_said(bags: Path, tmp_path: Path) -> None:
     async def go() -> Work:
-        work = Work({**settings(bags), "jobs": "one"}, tmp_path)  # not what the command line would pass on
+        work = Work({**settings(bags), "bags": [5]}, tmp_path)  # not what the command line would pass on
         work.start("read")
         await work.wait()
         return work
