@@ -47,7 +47,9 @@ Topics = Annotated[
 RigFile = Annotated[
     str | None,
     typer.Option(
-        "--rig", help="Another machine's adapter, as path.py:Class; BAGS are then the files that it reads."
+        "--rig",
+        help="Another machine's adapter, as path.py:Class; BAGS are then the files, or the "
+        "folder, that it reads.",
     ),
 ]
 MaxEffects = Annotated[
