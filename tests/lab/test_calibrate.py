@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -77,7 +78,7 @@ def test_a_stopped_calibration_goes_on_from_its_folder(tmp_path: Path) -> None:
         calibrate_targets(
             problem("sum", "difference"), NOMINAL, coordinates, starts=1, cache=tmp_path, progress=stop
         )
-    kept = len(list(tmp_path.glob("*.f8")))
+    kept = len(list(tmp_path.glob("*.npz")))
     assert kept == 5
     again = calibrate_targets(problem("sum", "difference"), NOMINAL, coordinates, starts=1, cache=tmp_path)
     fresh = calibrate_targets(problem("sum", "difference"), NOMINAL, coordinates, starts=1)
@@ -96,7 +97,7 @@ def test_a_stopped_calibration_goes_on_from_its_folder(tmp_path: Path) -> None:
 def test_a_cut_file_in_the_cache_is_made_again(tmp_path: Path) -> None:
     kept = Remembered(problem("sum"), "key", tmp_path)
     first = kept.residual(NOMINAL, {"friction.coulomb": 0.02})
-    (file,) = tmp_path.glob("*.f8")
+    (file,) = tmp_path.glob("*.npz")
     file.write_bytes(file.read_bytes()[:20])
     assert np.array_equal(kept.residual(NOMINAL, {"friction.coulomb": 0.02}), first)
 
@@ -177,3 +178,16 @@ def test_gains_may_be_free_and_that_they_are_marked_as_fixed_is_said(tmp_path: P
     assert kp.value == pytest.approx(0.46, rel=0.02)
     assert found.model.parameters.value("control.kp") == kp.value
     assert any("marked as fixed" in text for text in found.warnings)
+
+
+def test_a_full_disk_ends_the_keeping_and_not_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(file: object, **_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    kept = Remembered(problem("sum"), "key", tmp_path)
+    monkeypatch.setattr(np, "savez", full)
+    values = {"friction.coulomb": 0.02}
+    assert np.array_equal(kept.residual(NOMINAL, values), problem("sum").residual(NOMINAL, values))
+    assert not list(tmp_path.iterdir()), "nothing half written stays"

@@ -207,17 +207,19 @@ class Store:
         text = json.dumps({"key": key, "result": _emptied(result, arrays)})
         members = {"json": np.frombuffer(text.encode(), dtype=np.uint8)}
         members |= {f"a{k}": array for k, array in enumerate(arrays)}
-        part = ""
+        part: Path | None = None
         try:
-            handle, part = tempfile.mkstemp(suffix=".part", dir=self.folder)
+            handle, name = tempfile.mkstemp(suffix=".part", dir=self.folder)
+            part = Path(name)
             with os.fdopen(handle, "wb") as file:
                 np.savez(file, **members)  # type: ignore[arg-type]  # its stubs take names for options
-            Path(part).replace(self._path(key))
+            part.replace(self._path(key))
         except OSError as error:
             self._give_up(error)
-        except BaseException:
-            Path(part).unlink(missing_ok=True)
-            raise
+        finally:
+            if part is not None:
+                with suppress(OSError):
+                    part.unlink(missing_ok=True)  # what was not finished
         self._written += 1
         if self._written % 64 == 0:
             self.prune()

@@ -30,6 +30,10 @@ machine: chance makes it 1, and up to this where five repeats differ by one para
 ALIKE = 0.02
 """Candidates whose held-out error is this close to the best, as a part of it, tie with it."""
 
+ALIKE_WITHIN_CHANCE = 0.06
+"""The same of candidates that all leave no more than the machine repeats (AS_IT_REPEATS): what is left is scatter,
+which decides by which of them a condition is foretold a little better.  The better fit comes first then."""
+
 
 OF_NOMINAL = " times the fitted nominal model's"
 """What errors count in where nothing was repeated, in words."""
@@ -181,6 +185,7 @@ def _judge(
     """The best of the best fits by held-out error; of those that are alike, the one with the fewest parameters.
 
     One that would join too, and foretells as well, ties with it: also one of which the data leave something open.
+    Of those that all leave no more than the machine repeats, the better fit.
 
     An effect that must be bent into another form is no candidate while there are others.
     Each error counts in multiples of what it may be at most (LEFT_OPEN, or 1 - gain, of the mean square without it).
@@ -192,20 +197,24 @@ def _judge(
     most = [min(LEFT_OPEN, 1.0 - gain) if names else 1.0 - gain for names in left_open]
     scores = [error / math.sqrt(part) for error, part in zip(held, most, strict=True)]
     least = min(scores)
-    alike = [k for k in range(len(judged)) if scores[k] <= (1.0 + ALIKE) * least]
+    within = not units and min(held) <= AS_IT_REPEATS
+    near = 1.0 + (ALIKE_WITHIN_CHANCE if within else ALIKE)
+    alike = [k for k in range(len(judged)) if scores[k] <= near * least]
+    if within:
+        alike = [k for k in alike if held[k] <= AS_IT_REPEATS] or alike
     if not alike:
         return _Judged(judged[0], float("nan"), (), 1.0 - gain)
     for candidate in judged:
         search.keep(candidate)
-    winner = min(alike, key=lambda k: (len(judged[k].fit.coordinates), scores[k]))
+    winner = min(
+        alike, key=lambda k: (len(judged[k].fit.coordinates), judged[k].penalised if within else scores[k])
+    )
     joins = [error <= math.sqrt(part) * before for error, part in zip(held, most, strict=True)]
     others = [
         k
         for k in range(len(judged))
         if k != winner
-        and (
-            (k in alike and most[k] == most[winner]) or (joins[k] and held[k] <= (1.0 + ALIKE) * held[winner])
-        )
+        and ((k in alike and most[k] == most[winner]) or (joins[k] and held[k] <= near * held[winner]))
     ]
     rivals = tuple(judged[k] for k in sorted(others, key=lambda k: held[k]))
     error = search.once(held_out_error, judged[winner], False, units, text=f"{text}: held-out conditions")

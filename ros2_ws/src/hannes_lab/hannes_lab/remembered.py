@@ -1,10 +1,9 @@
-"""Residuals of simulations kept in a folder under the hash of all that determines them: a stopped fit goes on."""
+"""Residuals of simulations kept in a store under the hash of all that determines them: a stopped fit goes on."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from numpy.typing import NDArray
 
+from .cache import Store
 from .search import Progress
 
 Array = NDArray[np.float64]
@@ -23,12 +23,12 @@ class Remembered:
     """A problem whose residuals are kept in a folder, content-addressed; `folder` None keeps nothing."""
 
     def __init__(self, problem: Any, key: str, folder: Path | None, progress: Progress | None = None) -> None:
-        self.problem, self.key, self.folder = problem, key, folder
-        self.hits = 0
+        self.problem, self.key = problem, key
         self.done = 0
         self.failures = 0
         self._progress = progress
         self.total, self.text = 1, "simulation"
+        self._store: Store | None = None
         if folder is not None:
             try:
                 folder.mkdir(parents=True, exist_ok=True)
@@ -36,6 +36,12 @@ class Remembered:
                 raise HannesError(
                     f"Cannot use the cache folder '{folder}': {error}; give another --cache."
                 ) from error
+            self._store = Store(folder)
+
+    @property
+    def hits(self) -> int:
+        """Residuals that were in the folder."""
+        return self._store.hits if self._store else 0
 
     @property
     def features(self) -> Any:
@@ -51,21 +57,12 @@ class Remembered:
         self.done += 1
         if self._progress is not None:
             self._progress(self.done, max(self.total, self.done), self.text)
-        if self.folder is None:
-            return np.asarray(self.problem.residual(model, values), dtype=np.float64)
         text = self.key + model.sha256 + json.dumps(sorted((k, float(v)) for k, v in values.items()))
-        path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()}.f8"
-        if path.exists():
-            try:
-                kept = np.fromfile(path, dtype="<f8")
-                if kept.shape == (self.problem.features.size,):
-                    self.hits += 1
-                    return np.asarray(kept, dtype=np.float64)
-            except (OSError, ValueError):
-                path.unlink(missing_ok=True)  # cut off while it was written; it is made again
+        key = hashlib.sha256(text.encode()).hexdigest()
+        kept = self._store.read(key) if self._store else None
+        if kept is not None:
+            return np.asarray(kept, dtype=np.float64)
         out = np.asarray(self.problem.residual(model, values), dtype=np.float64)
-        part = path.with_suffix(f".{os.getpid()}.part")
-        with part.open("wb") as file:
-            out.astype("<f8").tofile(file)
-        part.replace(path)
+        if self._store:
+            self._store.write(key, out)
         return out

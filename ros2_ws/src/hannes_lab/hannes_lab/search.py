@@ -738,7 +738,7 @@ class Search:
         out = {}
         with suppress(NotPlain):
             self._key = self._key or content_hash(code_hash(), *self._shared)
-            minima = content_hash(sorted(self._minima.items()))
+            minima = content_hash([(k.hex(), fits) for k, fits in sorted(self._minima.items())])
             for k, item in enumerate(items):
                 out[k] = content_hash(self._key, minima, function.__module__, function.__qualname__, item)
         return out
