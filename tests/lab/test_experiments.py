@@ -28,7 +28,7 @@ def distance_of_fits(prepared: Prepared, names: Sequence[str]) -> float:
     )
     search.null()
     tied = [search.fitted((name,)) for name in names]
-    return separating_experiments(prepared, search, tied)[0].distance
+    return separating_experiments(prepared, tied)[0].distance
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +63,8 @@ def tied(undescribed: Prepared) -> tuple[Search, list[Candidate]]:
 def test_what_diverges_in_one_condition_leaves_the_others(
     undescribed: Prepared, tied: tuple[Search, list[Candidate]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    search, models = tied
-    assert any(e.name == "fast_soft" for e in separating_experiments(undescribed, search, models, keep=8))
+    _, models = tied
+    assert any(e.name == "fast_soft" for e in separating_experiments(undescribed, models, keep=8))
     simulate = HandRig.simulate
 
     def diverges(self: HandRig, model: Model, values: Any, trial: Trial, reference: Any) -> Any:
@@ -73,19 +73,19 @@ def test_what_diverges_in_one_condition_leaves_the_others(
         return simulate(self, model, values, trial, reference)
 
     monkeypatch.setattr(HandRig, "simulate", diverges)
-    left = separating_experiments(undescribed, search, models, keep=8)
+    left = separating_experiments(undescribed, models, keep=8)
     assert len(left) == 7 and all(e.name != "fast_soft" for e in left)
 
 
 def test_a_signal_that_never_changes_tells_nothing_apart(
     undescribed: Prepared, tied: tuple[Search, list[Candidate]]
 ) -> None:
-    search, models = tied
-    before = separating_experiments(undescribed, search, models)
+    _, models = tied
+    before = separating_experiments(undescribed, models)
     features = undescribed.features
     still = replace(features.blocks[0], signal="grip_force", measured=0.0 * features.blocks[0].measured)
     more = replace(features, blocks=(*features.blocks, still), slices=())
-    assert separating_experiments(replace(undescribed, features=more), search, models) == before
+    assert separating_experiments(replace(undescribed, features=more), models) == before
     # One closure: its roughness stands for the noise.
     alone = tuple(
         replace(
@@ -98,5 +98,5 @@ def test_a_signal_that_never_changes_tells_nothing_apart(
         for b in features.blocks
     )
     single = replace(undescribed, features=replace(features, blocks=alone, slices=()))
-    found = separating_experiments(single, search, models)
+    found = separating_experiments(single, models)
     assert found[0].distance == pytest.approx(before[0].distance, rel=1.5)

@@ -206,7 +206,7 @@ def test_figures_that_no_effect_needs_are_refused(
 ) -> None:
     monkeypatch.setattr(Joint, "known", known)
     with pytest.raises(HannesError, match=r"Joint.known: .* it takes numbers for encoder_eccentricity.ratio"):
-        check_rig(Joint([trial_of("a", reference(1.0))]), joint)
+        check_rig(Joint([trial_of("a", reference(1.0))]))
 
 
 def test_an_effect_in_a_model_file_is_found_beside_it(tmp_path: Path) -> None:

@@ -305,7 +305,7 @@ def _idle_at_the_end(
 
     alone   what joined after it, maybe as one of a pair, has gone
     """
-    if _may_be_nought(search, found, limits):
+    if _may_be_nought(search, found, spans_of(search, found, limits, falls)):
         return "by its 95 % intervals its strength may be nought"
     before, after = falls[-2].held_out, falls[-1].held_out
     if after > before:
@@ -322,10 +322,9 @@ def _idle_at_the_end(
     return ""
 
 
-def _may_be_nought(search: Search, found: Candidate, limits: Chance) -> bool:
+def _may_be_nought(search: Search, found: Candidate, intervals: Mapping[str, tuple[float, float]]) -> bool:
     """Whether the 95 % intervals of all strengths of the last effect hold the value at which it vanishes."""
     name = found.names[-1]
-    intervals = intervals_of(found.fit, limits, sway(search.problem, found.fit))
     return all(
         intervals[f"{name}.{p.name}"][0] <= p.vanishing <= intervals[f"{name}.{p.name}"][1]
         for p in search.effect(name).parameters
