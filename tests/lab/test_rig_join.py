@@ -173,6 +173,9 @@ def test_without_repeats_what_brings_left_out_conditions_no_nearer_is_no_finding
     assert answer.summary.startswith(
         "Whether something is missing cannot be told, for nothing was repeated: "
     )
+    told = answer.to_dict()
+    assert told["unknown_kind"] == "no_repeats" and told["error"]["held_out"] is False
+    assert np.isnan([told["error"][name] for name in ("nominal", "final", "repeatability")]).all()
 
 
 def test_a_travel_unlike_that_of_the_adapter_is_said(rig: type) -> None:

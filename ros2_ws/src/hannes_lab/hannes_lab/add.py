@@ -14,7 +14,7 @@ from hannes_sim.plant import PlantDiverged
 from .chance import chance
 from .delays import in_time
 from .diagnose import fitted_model, found_effects, spans_of
-from .diagnosis import Fall, FoundEffect, both_models
+from .diagnosis import Fall, FoundEffect, both_models, error_of
 from .executor import Executor
 from .falls import error_falls, fall_sentence
 from .features import data_used
@@ -47,13 +47,7 @@ class Addition:
             "summary": fall_sentence(self.falls),
             "effects": [e.to_dict() for e in self.effects],
             "falls": [f.to_dict() for f in self.falls],
-            "error": {
-                "nominal": self.falls[0].held_out,
-                "final": self.falls[-1].held_out,
-                "repeatability": 1.0,
-                "held_out": True,
-                "unit": "multiples of the repeatability between closures",
-            },
+            "error": error_of(self.falls),
             "data": [dict(d) for d in self.data],
             "notes": list(self.notes),
             **both_models(self.given, self.model),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -84,6 +84,23 @@ class Fall:
             "held_out_signals": dict(self.held_out_signals),
             "held_out_conditions": self.held_out_conditions,
         }
+
+
+ERROR_UNIT = "multiples of the repeatability between closures"
+
+
+def error_of(falls: Sequence[Fall]) -> dict[str, Any]:
+    """The error on held-out closures of the nominal model as given and of the last, in ERROR_UNIT; NaN where nothing
+    was repeated, which leaves no closure to hold out and no repeatability to count in."""
+    nominal, final = falls[0].held_out, falls[-1].held_out
+    known = math.isfinite(final)
+    return {
+        "nominal": nominal,
+        "final": final,
+        "repeatability": 1.0 if known else math.nan,
+        "held_out": known,
+        "unit": ERROR_UNIT,
+    }
 
 
 @dataclass(frozen=True)
@@ -179,13 +196,7 @@ class Diagnosis:
             "tied": [list(names) for names in self.tied],
             "greedy": self.greedy,
             "experiments": [e.to_dict() for e in self.experiments],
-            "error": {
-                "nominal": falls[0].held_out,
-                "final": falls[-1].held_out,
-                "repeatability": 1.0,
-                "held_out": True,
-                "unit": "multiples of the repeatability between closures",
-            },
+            "error": error_of(falls),
             "falls": [f.to_dict() for f in falls],
             "ranking": [r.to_dict() for r in self.ranking],
             "depends_on": {d.variable: d.to_dict() for d in self.depends_on},

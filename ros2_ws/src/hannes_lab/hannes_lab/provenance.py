@@ -12,10 +12,8 @@ from typing import Any
 
 from hannes_description.model import Model
 
-from .diagnosis import Fall
+from .diagnosis import ERROR_UNIT, Fall
 from .features import Features, data_used
-
-ERROR_UNIT = "multiples of the repeatability between closures"
 
 
 def made_from(model: Model, nominal: Model, features: Features, **more: Any) -> Model:
