@@ -348,6 +348,25 @@ def test_every_verdict(verdict: str, headline: str) -> None:
     assert "nan" not in page.words.lower().replace("nano", "")
 
 
+def test_a_frequency_is_named_where_it_is_clearest() -> None:
+    """Of the model before and after: a few percent of what is left afterwards are at any frequency."""
+
+    def at(hertz: float, share: float) -> dict[str, Any]:
+        found = {
+            "variable": "frequency",
+            "unit": "Hz",
+            "signal": "encoder_position",
+            "share": share,
+            "at": hertz,
+        }
+        return {"frequency": {**found, "centres": [1.0, 2.0, 6.0], "curve": [0.0, 0.2, 0.1]}}
+
+    comparison = {**make_comparison(), "depends_on": at(2.3, 0.4)}
+    after = {**make_comparison(off=0.05), "depends_on": at(6.0, 0.03)}
+    words = page_of(comparison=comparison, after=after).words.replace("\u00a0", " ")
+    assert "2.3 Hz" in words and ", 6.0 Hz" not in words
+
+
 def test_what_the_page_shows_of_an_effect() -> None:
     page = page_of(
         comparison=make_comparison(), after=make_comparison(off=0.05), diagnosis=make_diagnosis("effects")

@@ -546,8 +546,8 @@ def dependences(comparison: Part | None, after: Part | None, diagnosis: Part | N
         xs = [v for _, x, _ in curves for v in x if v is not None]
         ys = [v for _, _, y in curves for v in y if v is not None]
         steps = name == "direction"
-        at = text.known(sources[-1][1].get("at"))
-        unit = str(sources[-1][1].get("unit", ""))
+        clearest = max((d for _, d in sources), key=lambda d: text.known(d.get("share")) or 0.0)
+        at, unit = text.known(clearest.get("at")), str(clearest.get("unit", ""))
         where = "" if at is None else f", {text.number(at, 2)} {text.unit(unit)}"
         rows.append(
             {
