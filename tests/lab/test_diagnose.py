@@ -327,7 +327,7 @@ def test_a_fit_from_which_nothing_of_worth_is_in_reach_ends_early_and_is_not_kep
     assert whole.complete and same.complete and (same.cost, as_many) == (whole.cost, simulations)
     ended, fewer = tried(0.5 * whole.cost)
     assert not ended.complete and fewer < simulations and ended.cost >= whole.cost
-    assert search._known(Candidate((), ended, ended.cost)).fit is ended
+    assert search.keep(Candidate((), ended, ended.cost)).fit is ended
     assert () not in search.found, "a fit that ended early must not stand for the set"
 
 
