@@ -84,16 +84,26 @@ def test_with_the_effect_that_is_shown_it_is_found(prepared: Prepared, tmp_path:
     assert found.falls[-1].held_out < 0.05 * found.falls[1].held_out
 
 
-def test_what_rubs_at_a_place_is_said_to_and_found(tmp_path: Path) -> None:
-    """Of 3 N at 40 mm of the way, both ways; the machine has no other dry friction."""
+@pytest.mark.parametrize(
+    ("file", "kind", "guess", "variable", "said"),
+    [
+        ("local_friction.py", "LocalFriction", "10.0, 0.38, 0.05", "friction_by_position", "something rubs"),
+        ("local_torque.py", "LocalTorque", "0.1, 0.7, 0.05", "position", "goes with the position"),
+    ],
+)
+def test_what_acts_at_a_place_is_said_to_and_found(
+    tmp_path: Path, file: str, kind: str, guess: str, variable: str, said: str
+) -> None:
+    """What rubs with 3 N at 40 mm of the way, both ways, of a machine without other dry friction; or pulls there."""
     write_files(tmp_path)
     rig, model = load_rig(ADAPTER), Model.load(tmp_path / "mass.yaml")
-    mine = tmp_path / "rubs.py"
-    text = (SHOWN / "local_friction.py").read_text()
-    mine.write_text(text.replace("WIDTH = 10.0, 0.38, 0.05\n", "WIDTH = 2.0, 0.05, 0.01\n"))
-    source = f"{mine}:LocalFriction"
-    rubs = load_effect(source).entry({"level": 3.0, "place": 0.04, "width": 0.008}, source=source)
-    run = rollout(make_plant(model.with_effect(rubs)), rig([]).controller(model, 1e-3), reference(5))
+    mine = tmp_path / file
+    text = (SHOWN / file).read_text()
+    assert f"WIDTH = {guess}\n" in text
+    mine.write_text(text.replace(f"WIDTH = {guess}\n", "WIDTH = 2.0, 0.05, 0.01\n"))
+    source = f"{mine}:{kind}"
+    acts = load_effect(source).entry({"level": 3.0, "place": 0.04, "width": 0.008}, source=source)
+    run = rollout(make_plant(model.with_effect(acts)), rig([]).controller(model, 1e-3), reference(5))
     rng = np.random.default_rng(2)
     position = run.encoder_position + 2e-6 * rng.standard_normal(run.time.size)
     force = run.motor_voltage + 0.05 * rng.standard_normal(run.time.size)
@@ -103,7 +113,8 @@ def test_what_rubs_at_a_place_is_said_to_and_found(tmp_path: Path) -> None:
     found = diagnose(prepared, effect_sources(only=only, model=prepared.model))
     assert found.verdict == "unknown"
     first = found.depends_on[0]
-    assert first.variable == "friction_by_position" and first.at == pytest.approx(0.04, abs=0.005)
+    # A detent pulls most beside its place.
+    assert first.variable == variable and first.at == pytest.approx(0.04, abs=0.012)
     assert {d.variable: d.unit for d in found.depends_on} == {
         "position": "m",
         "velocity": "m/s",
@@ -113,7 +124,7 @@ def test_what_rubs_at_a_place_is_said_to_and_found(tmp_path: Path) -> None:
         "friction_by_position": "m",
         "frequency": "Hz",
     }
-    assert "something rubs" in found.notes[0]
+    assert said in found.notes[0] and file in found.notes[0]
     found = diagnose(prepared, effect_sources(only=["stribeck_friction", source], model=prepared.model))
     (effect,) = found.effects
     for name, true in (("level", 3.0), ("place", 0.04), ("width", 0.008)):

@@ -21,6 +21,9 @@ BRAKING = "friction_by_position"
 """What acts against the motion, by where: its mean over both directions is nothing."""
 
 BINS = 10
+OF_PLACE = {"position": 4, BRAKING: 2}
+"""Times as many bins: what acts at a place does so on a small part of the way."""
+
 BAND = 1.15
 """A frequency is a band from so many times lower to so many times higher."""
 
@@ -39,8 +42,8 @@ FEWEST = 16
 ROUNDING = 1e-12
 """Part of a residual's square below which it does not vary."""
 
-WORTH_SAYING = 0.2
-"""Share of a frequency, or of friction by position, from which it is said in words."""
+WORTH_SAYING = {FREQUENCY: 0.2, BRAKING: 0.2, "position": 0.4}
+"""Share from which it is said in words; much goes with the position in part."""
 
 ABOVE = 2.0
 """Times that a mean residual's square must exceed what the closures' scatter makes of it, to show a frequency."""
@@ -56,7 +59,7 @@ class Dependence:
              that is the same everywhere depends on nothing
     centres  (b,) of the variable, in `unit`; curve (b,) mean residual, in the signal's unit; of a frequency amplitudes
     unit     of the variable; of time and direction none
-    at       where it oscillates in all conditions, or where what acts against the motion is largest; in `unit`
+    at       where it oscillates in all conditions, or where what acts at a place is largest; in `unit`
     """
 
     variable: str
@@ -124,12 +127,12 @@ def residual_dependences(
 
 
 def pointed_at(found: Sequence[Dependence]) -> str:
-    """A sentence where a residual goes with one frequency, or friction at a place, as with nothing else; or empty.
+    """A sentence where a residual goes with one frequency, or with a place, as with nothing else; or empty.
 
     Where the way ends the machine turns, and all that has to do with starts and stops is largest there.
     """
     for first in sorted(found, key=lambda d: -d.share):
-        if first.at is None or first.share < WORTH_SAYING:
+        if first.at is None or first.share < WORTH_SAYING[first.variable]:
             return ""
         what = f"{100 * first.share:.0f} % of what is left of {first.signal}"
         where = f"{first.at:.2g} {first.unit}"
@@ -139,11 +142,17 @@ def pointed_at(found: Sequence[Dependence]) -> str:
                 "takes for rigid (a shaft, a belt, a mount, what hangs); examples/effects/elastic_load.py is an effect "
                 "for it"
             )
-        if first.at not in (first.centres[0], first.centres[-1]):
+        if first.at in (first.centres[0], first.centres[-1]):
+            continue
+        if first.variable == "position":
             return (
-                f"{what} acts along or against the motion by where it is, either way, most at {where}: something rubs "
-                "or is lubricated there; examples/effects/local_friction.py is an effect for it"
+                f"{what} goes with the position, whichever way and however fast, most near {where}: a detent, a "
+                "magnet, a spring or a cam acts there; examples/effects/local_torque.py is an effect for it"
             )
+        return (
+            f"{what} acts along or against the motion by where it is, either way, most at {where}: something rubs or "
+            "is lubricated there; examples/effects/local_friction.py is an effect for it"
+        )
     return ""
 
 
@@ -246,7 +255,11 @@ def _dependences(
         else:
             values = np.concatenate([a.mean(axis=0) for a in states[variable]])
             target = r
-        out.append(_dependence(variable, signal, values, target))
+        one = _dependence(variable, signal, values, target)
+        if variable == "position" and one.curve:
+            away = np.abs(np.subtract(one.curve, np.mean(one.curve)))
+            one = replace(one, at=one.centres[int(np.argmax(away))])
+        out.append(one)
     if "position" in states and "velocity" in states:
         position, velocity = (
             np.concatenate([a.mean(axis=0) for a in states[name]]) for name in ("position", "velocity")
@@ -272,7 +285,7 @@ def _dependence(variable: str, signal: str, x: Array, y: Array, direction: Array
         groups = np.unique(labels)
         index: NDArray[np.int64] = np.searchsorted(groups, labels)
     else:
-        bins = 2 * BINS if variable == BRAKING else BINS
+        bins = BINS * OF_PLACE.get(variable, 1)
         edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, bins + 1)))
         if edges.size < 3:
             return Dependence(variable, signal, 0.0, (), ())
