@@ -7,18 +7,21 @@ import hashlib
 import json
 import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from hannes_description.errors import HannesError
 from hannes_lab.compare import MetricRow
-from hannes_lab.diagnosis import Fall
+from hannes_lab.diagnosis import Fall, Rank
+from hannes_lab.errors import SignalError
 from hannes_lab.falls import fall_sentence
 from hannes_lab.pictures import write_picture
 from hannes_lab.report import embedded_json, render_report, write_report
-from hannes_lab.report_next import next_step
+from hannes_lab.report_next import next_step, runner_up
 from hannes_lab.report_text import (
     UNKNOWN,
     interval,
@@ -30,6 +33,7 @@ from hannes_lab.report_text import (
     signed_percent,
     unit,
 )
+from hannes_lab.wording import unforetold
 
 NAN = math.nan
 TIME = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
@@ -587,6 +591,38 @@ def test_the_card_and_the_summary_tell_the_same_fall() -> None:
     assert fall_sentence(falls).endswith(
         "falls from 2.00 (nominal, as given) to 0.95 times the repeatability."
     )
+
+
+def test_where_nothing_was_repeated_the_fall_begins_with_the_nearer_nominal_model() -> None:
+    """As given 3.4 on what was left out, fitted 5.6, with an effect 1.9: not even halved."""
+    diagnosis = make_diagnosis("effects")
+    for fall, rmse in zip(diagnosis["falls"], (3.4, 5.6, 1.9), strict=True):
+        fall |= {"train": NAN, "held_out": NAN, "by_condition": {"slow": NAN}}
+        fall["held_out_signals"] = {"encoder_position": rmse}
+    words = page_of(comparison=make_comparison(closures=1), diagnosis=diagnosis).words.replace("\u00a0", " ")
+    assert "3.40 → 1.90 rad error of encoder position" in words and "before: nominal, as given" in words
+    signals = (SignalError("slow", "encoder_position", "rad", 0.1, NAN, NAN),)
+    falls = [Fall(f["added"], NAN, NAN, {}, signals, f["held_out_signals"]) for f in diagnosis["falls"]]
+    assert "encoder_position from 3.4 to 1.9 rad" in fall_sentence(falls)
+    assert runner_up({"excess": True, "first": [], "rest": []}, diagnosis) is None
+
+
+def test_an_effect_that_explains_most_and_foretells_nothing_is_named_in_a_note() -> None:
+    """Of a start and of laps the one does not foretell the other: no effect joins, whatever it explains."""
+    rank = Rank(("cogging",), 10.0, 14.0, 0.91)
+
+    def told(explained: float, names: tuple[str, ...] = (), repeated: bool = True) -> tuple[str, ...]:
+        features = SimpleNamespace(repeated=repeated)
+        choice = SimpleNamespace(
+            ranking=(Rank(("gravity",), 90.0, 94.0, 0.0), replace(rank, explained=explained)),
+            best=SimpleNamespace(names=names),
+            search=SimpleNamespace(problem=SimpleNamespace(features=features)),
+        )
+        return unforetold(choice)  # type: ignore[arg-type]
+
+    (note,) = told(0.91)
+    assert note.startswith("cogging alone explains 91 %") and "hannes add --effect cogging" in note
+    assert not told(0.3) and not told(0.91, ("cogging",)) and not told(0.91, repeated=False)
 
 
 def test_overlays_of_the_same_condition_keep_their_counterparts() -> None:

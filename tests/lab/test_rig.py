@@ -374,6 +374,20 @@ def test_what_the_table_shows_decides_whether_an_effect_joins(prepared: Prepared
     assert all(b**2 <= 0.85 * a**2 for a, b in itertools.pairwise(errors))
 
 
+def test_one_mass_has_no_part_of_a_friction_beyond_a_wire(recording: Path) -> None:
+    """There both parts act on the same mass: half of the coefficient, or half of it beyond a wire, are one thing."""
+    rig, model = load_rig(ADAPTER), Model.load(recording.parent / "mass.yaml")
+    made = prepare(rig.read([recording]), model, rig=rig).rig
+    capstan = load_effect("load_dependent_friction")
+    for one in (made, pickle.loads(pickle.dumps(made))):
+        kind = one.effect(capstan)
+        assert [p.name for p in kind.parameters] == ["coefficient"]
+        assert [p.name for p in kind.figures()] == ["coefficient", "share"]
+        assert kind.entry({"coefficient": 0.2}).values == {"coefficient": 0.2, "share": 0.0}
+    made.one_mass = False
+    assert [p.name for p in made.effect(capstan).parameters] == ["coefficient", "share"]
+
+
 def test_little_explained_is_unknown(prepared: Prepared) -> None:
     """A ripple beside dry friction of five times its size: alone it is no answer, though the error falls."""
     found = diagnose(prepared, effect_sources(only=["cogging", "command_delay"]), greedy=True)

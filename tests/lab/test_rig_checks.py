@@ -176,6 +176,18 @@ def test_what_the_class_says_wrongly_is_refused(lab: Lab, more: str, said: str) 
     assert said in lab.refused(more=more)
 
 
+def test_a_gain_of_the_law_among_the_tolerances_is_led_to_run(lab: Lab) -> None:
+    some = "value: 3, lower: 0, upper: 50, status: assumed, source: x"
+    with_model(
+        lab,
+        friction=f"friction: {{viscous: {{{some}, unit: N.s/m}}}}\ncontrol: {{kp: {{{some}, unit: V/m}}}}",
+    )
+    file = lab.here / "mine.yaml"
+    file.write_text("control.kp: {sd: 0.1, closure_sd: 0, unit: '1', source: x}\n")
+    said = lab.refused(more=f"population = property(lambda self: {str(file)!r})")
+    assert "'control.kp' is a gain of the control law" in said and "take it out of `values`" in said
+
+
 def test_a_machine_may_show_nothing_of_what_its_drive_gives(lab: Lab) -> None:
     code, out, _ = lab(more="drive_signals = ()")
     assert code == 0 and "no current is recorded (only encoder_position, drive_force)" in out

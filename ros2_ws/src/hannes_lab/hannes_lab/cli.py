@@ -120,9 +120,7 @@ def diagnose(
             max_effects=max_effects,
             greedy=greedy,
         )
-    no_finding = found.verdict == "unknown" and found.effects
-    nearest = " (of the nearest effects, which are no finding)" if no_finding else ""
-    files = [_model_file(found, out, nearest)] if add else []
+    files = [_model_file(found, out)] if add else []
     files += [_report_of(report, prepared, found)] if report else []
     answer = found.to_dict() | {"model_file": str(out) if add else None}
     deliver(json, answer, lambda: show_diagnosis(found, prepared.rig.machine), files)
@@ -281,8 +279,15 @@ def report(
     deliver(json, answer, lambda: typer.echo(found.summary), [_report_of(out, prepared, found)])
 
 
-def _model_file(found: Diagnosis | Addition, path: Path, remark: str = "") -> Output:
-    return Output(f"Model file{remark}", path, lambda to: save_model(found.model, to, own_command()))
+def _model_file(found: Diagnosis | Addition, path: Path) -> Output:
+    nearest = isinstance(found, Diagnosis) and found.verdict == "unknown" and found.effects
+    remarks = ["of the nearest effects, which are no finding"] if nearest else []
+    left_out = sorted({n.partition("@")[0] for n in found.values if n not in found.model.names})
+    if left_out:
+        remarks.append(f"without what is of the recordings: {', '.join(left_out)}")
+    return Output(
+        "Model file", path, lambda to: save_model(found.model, to, own_command()), "; ".join(remarks)
+    )
 
 
 def _report_of(path: Path, prepared: Prepared, found: Diagnosis | Addition) -> Output:

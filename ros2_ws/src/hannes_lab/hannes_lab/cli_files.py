@@ -13,11 +13,12 @@ from hannes_description.output import print_json
 
 
 class Output(NamedTuple):
-    """A file that a command writes: what it is (\"Report\"), where, and what writes it there."""
+    """A file that a command writes: what it is (\"Report\"), where, what writes it there, and what to know of it."""
 
     what: str
     path: Path
     write: Callable[[Path], None]
+    remark: str = ""
 
 
 def deliver(
@@ -35,7 +36,7 @@ def deliver(
         else:
             show()
     for file in () if json else files:
-        typer.echo(f"{file.what}: {file.path}")
+        typer.echo(f"{file.what}: {file.path}" + (f" ({file.remark})" if file.remark else ""))
 
 
 def check_writable(path: Path, what: str) -> None:

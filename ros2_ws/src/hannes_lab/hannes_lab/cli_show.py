@@ -158,8 +158,9 @@ def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> 
     for signal in signals:
         table.add_column(_heading(signal, units[signal]), justify="right")
     for k, fall in enumerate(found.falls):
-        if len(fall.by_condition) > _LISTED:
-            worst = max(fall.by_condition, key=fall.by_condition.__getitem__)
+        known = {c: v for c, v in fall.by_condition.items() if math.isfinite(v)}
+        if len(fall.by_condition) > _LISTED and known:
+            worst = max(known, key=known.__getitem__)
             conditions = f"at most {number(fall.by_condition[worst], 3)}, {worst}"
         else:
             conditions = ", ".join(f"{c} {number(v, 3)}" for c, v in fall.by_condition.items())

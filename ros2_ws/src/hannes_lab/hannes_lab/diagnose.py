@@ -36,6 +36,7 @@ from .experiments import separating_experiments
 from .falls import (
     NOMINAL_FITTED,
     WITHOUT_EFFECT,
+    before,
     deciding_errors,
     error_falls,
     left_out_errors,
@@ -59,6 +60,7 @@ from .wording import (
     notes,
     other_clock,
     summary,
+    unforetold,
     unknown_kind,
     worse_fitted,
 )
@@ -151,13 +153,15 @@ def diagnose(
     intervals = spans_of(search, best, limits, falls)
     effects = found_effects(search, best, intervals, falls)
     clock = other_clock(search.problem, best.fit) if greedy or verdict == "unknown" else None
-    kind = unknown_kind(search, effects, choice, answer.bent, only) if verdict == "unknown" else ""
+    unknown = verdict == "unknown"
+    lost = unforetold(choice) if greedy and unknown else ()
+    kind = unknown_kind(search, effects, choice, answer.bent, only, bool(lost)) if unknown else ""
     depends_on = residual_dependences(
         prepared.features,
         prepared.features.closures(prepared.rig, best.fit.model, best.fit.values),
         prepared.rig.drive_signals,
     )
-    pointer = pointed_at(depends_on) if verdict == "unknown" else ""
+    pointer = pointed_at(depends_on) if unknown and not lost else ""
     experiments = separating_experiments(prepared, [search.fit_of(n) for n in tied]) if len(tied) > 1 else ()
     return Diagnosis(
         verdict=verdict,
@@ -192,7 +196,7 @@ def diagnose(
         },
         nuisances=nuisance_table(best.fit, intervals),
         notes=(
-            *((pointer,) if pointer else ()),
+            *((pointer,) if pointer else lost),
             *prepared.notes,
             *choice.notes,
             *((choice.left,) if choice.left and verdict != "unknown" else ()),
@@ -281,7 +285,8 @@ def _behind_the_law(
 def _borne_out(choice: Choice, null: Candidate, falls: tuple[Fall, ...]) -> tuple[Choice, tuple[Fall, ...]]:
     """A greedy choice without the effects at its end that are none, and then judged again.
 
-    What joined as one of a pair must take its part by itself once the other has gone.
+    What joined as one of a pair must take its part by itself once the other has gone.  The error falls from that of the
+    nominal model as it was given, where its fit foretells worse.
     """
     search, limits, notes = choice.search, choice.limits, choice.notes
     best = search.with_spread(choice.best)
@@ -290,12 +295,13 @@ def _borne_out(choice: Choice, null: Candidate, falls: tuple[Fall, ...]) -> tupl
         notes += (f"{best.names[-1]} joined too, but {why}: it is left out",)
         falls, alone = falls[:-1], True
         best = search.with_spread(search.fit_of(best.names[:-1]))
-    if not alone:
-        return choice, falls
     deciding = deciding_errors(falls)
-    first, last = deciding[NOMINAL_FITTED], deciding[-1]
-    fewer = replace(choice, best=best, rivals=(), notes=notes)
-    return judged_by_conditions(fewer, null, first, last), falls
+    given = before(deciding) != NOMINAL_FITTED
+    if not alone and not (given and best.names):
+        return choice, falls
+    if alone:
+        choice = replace(choice, best=best, rivals=(), notes=notes)
+    return judged_by_conditions(choice, null, deciding[before(deciding)], deciding[-1]), falls
 
 
 def _idle_at_the_end(
@@ -457,7 +463,8 @@ def fitted_model(
     }
     provenance = {**model.provenance, "intervals_95": spans} if spans else model.provenance
     out = replace(out, plant=model.plant, provenance=provenance)
-    return made_from(out, model, prepared.features, falls=falls_made(falls))
+    others = {n: float(f"{v:.6g}") for n, v in values.items() if n not in out.names}
+    return made_from(out, model, prepared.features, falls=falls_made(falls), recordings=others)
 
 
 def _entry(search: Search, name: str, values: Mapping[str, float]) -> EffectEntry:

@@ -227,11 +227,19 @@ def errors_in_units(falls: Sequence[Mapping[str, Any]]) -> tuple[bool, list[dict
     return False, out
 
 
+def before_in_units(steps: Sequence[Mapping[str, float]]) -> int:
+    """The same of errors by signal, each in its unit (errors_in_units): by their ratios to the fitted nominal's."""
+    given, fitted = steps[0], steps[NOMINAL_FITTED]
+    ratios = [given[s] / error for s, error in fitted.items() if s in given and error > 0.0]
+    return before([float(np.sqrt(np.mean(np.square(ratios)))) if ratios else np.nan, 1.0])
+
+
 def _in_units(falls: Sequence[Fall]) -> str:
-    """How the error of each signal changes from the fitted nominal model to the last step."""
+    """How the error of each signal changes from the nominal model to the last step."""
     held, steps = errors_in_units([fall.to_dict() for fall in falls])
     units = {e.signal: e.unit for e in falls[-1].signals}
-    old, new = steps[NOMINAL_FITTED], steps[-1]
+    first = before_in_units(steps) if len(falls) > WITHOUT_EFFECT else NOMINAL_FITTED
+    old, new = steps[first], steps[-1]
     each = [
         f"{name} "
         + (f"{new[name]:.3g}" if len(falls) == WITHOUT_EFFECT else f"from {old[name]:.3g} to {new[name]:.3g}")

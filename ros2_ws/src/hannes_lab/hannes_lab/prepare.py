@@ -187,6 +187,7 @@ def prepare(
     if rig is None:
         trials = with_seen_objects(with_one_clock(trials, model), model)
         made = HandRig(trials)
+    made.one_mass = "wire.stiffness" not in model.names or model.named("wire.stiffness").value == 0.0
     told = [] if isinstance(made, HandRig) else check_rig(made)
     features = build_features(trials, _present(trials, signals), made.points, made.finest, made.same)
     nuisances = tuple(made.nuisances(model))
@@ -242,7 +243,8 @@ def _what_is_missing(trials: Sequence[Trial], features: Features, rig: Rig) -> l
         )
     if "encoder_position" not in present:
         notes.append(
-            "no encoder position is recorded: sensor offsets, slack and backlash cannot be told apart"
+            "no encoder position is recorded: sensor offsets, slack and backlash cannot be told apart, and the "
+            "period of a ripple is hard to find"
         )
     for signal in present:
         where = [trial.name for trial in trials if signal in trial.signals]

@@ -26,7 +26,7 @@ from markupsafe import Markup
 from . import report_text as text
 from .diagnosis import has_excess
 from .experiments import VISIBLE
-from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, before, errors_in_units, step_name
+from .falls import WITHOUT_EFFECT, before, before_in_units, errors_in_units, step_name
 from .report_next import SHOWN, how_sure, next_step, runner_up
 from .report_svg import curve_svg, overlay_svg, tick_text
 
@@ -286,10 +286,8 @@ def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None
     now = after if after is not None else comparison
     in_units = fall_in_units(falls)
     if in_units is not None and len(falls) > 1:
-        start, end = (
-            in_units["rows"][NOMINAL_FITTED if len(falls) > WITHOUT_EFFECT else 0],
-            in_units["rows"][-1],
-        )
+        nearer = before_in_units(errors_in_units(falls)[1]) if len(falls) > WITHOUT_EFFECT else 0
+        start, end = in_units["rows"][nearer], in_units["rows"][-1]
         where = "on conditions that were left out of the fit" if in_units["held"] else "of the fit"
         for k, (signal, unit) in enumerate(in_units["signals"][:FIGURES]):
             out.append(

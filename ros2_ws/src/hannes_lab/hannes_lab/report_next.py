@@ -105,9 +105,10 @@ def how_sure(effects: Sequence[Part]) -> list[dict[str, Any]]:
 def runner_up(ranking: Part | None, diagnosis: Part | None) -> dict[str, Any] | None:
     """The best effect that is neither in the verdict nor tied with it, and the part that it explains alone.
 
-    None where there is no excess of misfit to explain.
+    None where there is no excess of misfit to explain, or where nothing was repeated: a share of a guess is none.
     """
-    if ranking is None or not ranking["excess"]:
+    falls = (diagnosis or {}).get("falls") or [{}]
+    if ranking is None or not ranking["excess"] or text.known(falls[-1].get("held_out")) is None:
         return None
     tied = {" + ".join(text.words(n) for n in names) for names in (diagnosis or {}).get("tied") or []}
     rows = [*ranking["first"], *ranking["rest"]]

@@ -13,13 +13,15 @@ _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 UNKNOWN = {
     "not_in_catalogue": "Something is missing that is not in the catalogue",
     "not_looked_for": "Something is missing that is not one of those that were looked for",
+    "not_foretold": "Something is missing, and these conditions cannot tell what",
     "model_or_effect": "Something is missing, or the nominal model is not that of this machine",
     "no_repeats": "Whether something is missing cannot be told",
 }
 """What is said first of each kind of "unknown" (`Diagnosis.unknown_kind`).
 
-Nobody can tell the third from the first two; the last is where nothing was repeated, and nothing brings what was left
-out nearer.
+Where conditions do not foretell one another, an effect may explain most of them all and yet not be borne out
+(`not_foretold`); nobody can tell another machine's model from an effect; the last is where nothing was repeated, and
+nothing brings what was left out nearer.
 """
 
 NO_FINDING = "These effects come nearest. They are no finding, whatever their intervals: more is missing."

@@ -205,10 +205,11 @@ class PlantRig:
         self._signals: OrderedDict[tuple[Any, ...], dict[str, Array]] = OrderedDict()
         self._came_back = True
         self._model: tuple[Model, tuple[str, ...], dict[str, float]] | None = None
+        self.one_mass = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A class from a user's file cannot be imported by name in another process.
-        return (_rebuild, (self.source or type(self), self.trials))
+        return (_rebuild, (self.source or type(self), self.trials, self.one_mass))
 
     def _unknown(self) -> dict[str, str]:
         """Effects that need a figure of a machine which is not the hand, and which its adapter does not give."""
@@ -300,7 +301,7 @@ class PlantRig:
         if catalogue().get(kind.name) is not kind:
             return kind
         sizes, known = tuple(sorted(self.sizes.items())), tuple(sorted(self.known.items()))
-        return scaled_effect(kind, sizes, self.linear, known)  # type: ignore[arg-type]  # a class is hashable
+        return scaled_effect(kind, sizes, self.linear, known, self.one_mass)  # type: ignore[arg-type]  # a class is hashable
 
     def comes_back(self, model: Model, trial: Trial) -> float:
         """Part of the reference's span within which a closure ends where the one before it did, if all repeat it.
@@ -391,6 +392,11 @@ class PlantRig:
             plant.set(name, base[name])
         for name, value in wanted.items():
             if name not in base:
+                if name.startswith("control.") and name not in plant.names:
+                    raise HannesError(
+                        f"'{name}' is a gain of the control law, which the plant does not know: in the adapter's "
+                        "`run`, take it out of `values`, and give the law a model that has it (model.with_values)."
+                    )
                 base[name] = plant.get(name)
             plant.set(name, value)
         if before is not None:
@@ -522,8 +528,10 @@ def load_rig(source: str) -> type[PlantRig]:
     return found
 
 
-def _rebuild(rig: str | type[PlantRig], trials: tuple[Trial, ...]) -> PlantRig:
-    return (load_rig(rig) if isinstance(rig, str) else rig)(trials)
+def _rebuild(rig: str | type[PlantRig], trials: tuple[Trial, ...], one_mass: bool) -> PlantRig:
+    made = (load_rig(rig) if isinstance(rig, str) else rig)(trials)
+    made.one_mass = one_mass
+    return made
 
 
 # -- effects of the catalogue on a machine of another size ----------------------------------------------------------
@@ -541,15 +549,20 @@ def scaled_effect(
     sizes: tuple[tuple[str, float], ...],
     linear: bool,
     known: tuple[tuple[str, float], ...] = (),
+    one_mass: bool = False,
 ) -> EffectType:
     """The effect with bounds, typical values and starts scaled by dimension to a machine of other sizes.
 
-    known  the machine's figures by effect.name
+    known     the machine's figures by effect.name
+    one_mass  nothing is beyond a wire: a parameter that says which part of the effect is there is known, 0
     """
-    if not sizes and not linear and not known:
+    beyond = tuple(p for p in kind.parameters if one_mass and p.beyond_wire)
+    if not (sizes or linear or known or beyond):
         return kind
     parameters = []
     for p in kind.parameters:
+        if p in beyond:
+            continue
         f = unit_factor(p.unit, dict(sizes))
         parameters.append(
             replace(
@@ -568,8 +581,12 @@ def scaled_effect(
         (kind,),
         {
             "parameters": tuple(parameters),
-            "known": tuple(
-                replace(p, typical=dict(known).get(f"{kind.name}.{p.name}", p.typical)) for p in kind.known
+            "known": (
+                *beyond,
+                *(
+                    replace(p, typical=dict(known).get(f"{kind.name}.{p.name}", p.typical))
+                    for p in kind.known
+                ),
             ),
             "__doc__": kind.__doc__,
         },

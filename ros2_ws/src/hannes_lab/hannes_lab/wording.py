@@ -52,6 +52,9 @@ HELD = 0.01
 NAMED = 4
 """Effects that a sentence names; of more, it says how many."""
 
+MOST = 0.5
+"""Part of the excess misfit that an effect explains alone from which it is worth a note where it does not join."""
+
 NOUGHT = 1e-9
 """What is less is said as 0: no parameter of a machine is that small in SI."""
 
@@ -60,12 +63,17 @@ MANY_FAILURES = 0.05
 
 
 def unknown_kind(
-    search: Search, effects: Sequence[FoundEffect], choice: Choice, bent: str, only: Sequence[str]
+    search: Search, effects: Sequence[FoundEffect], choice: Choice, bent: str, only: Sequence[str], lost: bool
 ) -> str:
-    """Which kind of "unknown" an answer is, a key of UNKNOWN; see `summary` for `bent` and `only`."""
+    """Which kind of "unknown" an answer is, a key of UNKNOWN; see `summary` for `bent` and `only`.
+
+    lost  an effect explains most of the misfit, but what was left out is foretold no better with it (`unforetold`)
+    """
     repeated = search.problem.features.repeated
     if not (effects or bent or repeated):
         return "no_repeats"
+    if lost:
+        return "not_foretold"
     if choice.other_model or not repeated or (bent and not effects):
         return "model_or_effect"
     return "not_looked_for" if only else "not_in_catalogue"
@@ -207,6 +215,20 @@ def notes(
         *_taken_for_its_own(search, best),
         *_identifiability(best),
         *failure_notes(search.problem),
+    )
+
+
+def unforetold(choice: Choice) -> tuple[str, ...]:
+    """A sentence on an effect that explains most of the fit's misfit alone, and yet does not join."""
+    first = max(choice.ranking, key=lambda rank: rank.explained, default=None)
+    known = choice.search.problem.features.repeated
+    if first is None or choice.best.names or not known or first.explained < MOST:
+        return ()
+    names = " + ".join(first.names)
+    return (
+        f"{names} alone explains {100 * first.explained:.0f} % of the excess misfit of a fit to all conditions, but "
+        "those that were left out of a fit are foretold no better with it: they may be too unlike to foretell one "
+        f"another. `hannes add --effect {first.names[0]}` shows what it does to closures that were left out",
     )
 
 

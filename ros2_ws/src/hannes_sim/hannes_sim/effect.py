@@ -47,6 +47,7 @@ class EffectParameter:
                    searched at multiples of its typical value
     description    what it is
     part           True for a part of a whole: both ends of its range are values like any other
+    beyond_wire    True for the part that acts beyond the wire: one mass has none, and nothing tells it there
     period         True for a period in the motor's position: a search also starts from the lines in the spectrum of
                    the residual over the position
     sd             of a shape: standard deviation of what is usual about `typical`.  Fits begin there and pay for what
@@ -63,6 +64,7 @@ class EffectParameter:
     starts: tuple[float, ...] = ()
     period: bool = False
     part: bool = False
+    beyond_wire: bool = False
     sd: float = 0.0
 
     def __post_init__(self) -> None:

@@ -28,6 +28,7 @@ class LoadDependentFriction(Effect):
             "part of it that acts on the hand's side of the wire",
             starts=(0.0, 1.0),
             part=True,
+            beyond_wire=True,
         ),
     )
     looks_like = (
