@@ -161,7 +161,7 @@ def diagnose(
         prepared.features.closures(prepared.rig, best.fit.model, best.fit.values),
         prepared.rig.drive_signals,
     )
-    pointer = pointed_at(depends_on) if unknown and not lost else ""
+    pointer = pointed_at(depends_on) if unknown else ""
     experiments = separating_experiments(prepared, [search.fit_of(n) for n in tied]) if len(tied) > 1 else ()
     return Diagnosis(
         verdict=verdict,
@@ -196,7 +196,8 @@ def diagnose(
         },
         nuisances=nuisance_table(best.fit, intervals),
         notes=(
-            *((pointer,) if pointer else lost),
+            *((pointer,) if pointer else ()),
+            *lost,
             *prepared.notes,
             *choice.notes,
             *((choice.left,) if choice.left and verdict != "unknown" else ()),

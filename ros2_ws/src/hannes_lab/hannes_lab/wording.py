@@ -52,7 +52,7 @@ HELD = 0.01
 NAMED = 4
 """Effects that a sentence names; of more, it says how many."""
 
-MOST = 0.5
+MOST = 0.75
 """Part of the excess misfit that an effect explains alone from which it is worth a note where it does not join."""
 
 NOUGHT = 1e-9
