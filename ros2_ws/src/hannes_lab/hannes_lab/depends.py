@@ -147,8 +147,8 @@ def pointed_at(found: Sequence[Dependence]) -> str:
         if first.variable == "position":
             return (
                 f"{what} goes with the position, whichever way and however fast, most near {where}: a detent, a "
-                "magnet, a spring or a cam acts there, or a ripple of another form; examples/effects/local_torque.py is "
-                "an effect for it"
+                "magnet, a spring or a cam acts there, or a ripple of another form; examples/effects/local_torque.py "
+                "is an effect for it"
             )
         return (
             f"{what} acts along or against the motion by where it is, either way, most at {where}: something rubs or "
