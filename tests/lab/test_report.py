@@ -446,6 +446,16 @@ def test_what_to_run_next(verdict: str, command: str, then: str | None) -> None:
     assert (step and step["command"]) == then
 
 
+def test_what_explains_most_and_foretells_nothing_is_worth_a_look() -> None:
+    told = {
+        "unknown_kind": "not_foretold",
+        "ranking": [{"names": ["gravity"], "explained": 0.1}, {"names": ["cogging"], "explained": 0.9}],
+    }
+    step = next_step("unknown", told, "hannes diagnose b --rig a.py:A --only cogging --greedy --jobs 1")
+    assert step is not None and "cogging does to closures that were left out" in step["text"]
+    assert step["command"] == "hannes add b --rig a.py:A --jobs 1 --effect cogging"
+
+
 def test_ties_that_nothing_separates_give_no_command() -> None:
     diagnosis = make_diagnosis("effects")
     diagnosis["experiments"][0]["distance"] = 0.1

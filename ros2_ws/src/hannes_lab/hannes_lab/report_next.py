@@ -48,9 +48,25 @@ def next_step(kind: str, diagnosis: Part | None, command: str) -> dict[str, str]
             "text": "Record each motion five times or more: only repeats tell what is scatter",
             "command": "",
         }
+    ranking = (diagnosis or {}).get("ranking") or []
+    if (diagnosis or {}).get("unknown_kind") == "not_foretold" and ranking:
+        return _explains_most(words, max(ranking, key=lambda r: text.known(r.get("explained")) or 0.0))
     return {
         "text": "Write down what you suspect as an effect of your own, and let it take part",
         "command": shlex.join([*words, "--effect", OWN_EFFECT]),
+    }
+
+
+def _explains_most(words: Sequence[str], rank: Part) -> dict[str, str]:
+    """Adding the effects that explain most of the fit, though conditions do not foretell one another with them."""
+    rest = [w for w in words[2:] if w not in ("--greedy", "--no-greedy", "--json", "--add")]
+    for option in ("--max-effects", "--only", "--effect", "--out"):
+        rest = _without(rest, option)
+    names = [str(name) for name in rank.get("names", [])]
+    given = [word for name in names for word in ("--effect", name)]
+    return {
+        "text": f"See what {text.listed([text.words(n) for n in names])} does to closures that were left out",
+        "command": shlex.join(["hannes", "add", *rest, *given]),
     }
 
 
