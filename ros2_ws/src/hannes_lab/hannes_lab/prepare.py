@@ -187,7 +187,8 @@ def prepare(
     if rig is None:
         trials = with_seen_objects(with_one_clock(trials, model), model)
         made = HandRig(trials)
-    made.one_mass = "wire.stiffness" not in model.names or model.named("wire.stiffness").value == 0.0
+    wired = "wire.stiffness" in model.names and model.named("wire.stiffness").value > 0.0
+    made.one_mass = model.plant == "reduced" and not wired
     told = [] if isinstance(made, HandRig) else check_rig(made)
     features = build_features(trials, _present(trials, signals), made.points, made.finest, made.same)
     nuisances = tuple(made.nuisances(model))

@@ -170,6 +170,8 @@ class PlantRig:
     known        figures of this machine that effects need, as "gravity.turn": 1.0; without them those have no meaning
     floor, points, drive_signals, pooled, approximate, foreign, phases, machine, figures, experiments  see Rig
 
+    one_mass     nothing is beyond a wire; `prepare` says so, which knows the model
+
     Plants are built once per (model structure, trial) and then only re-parametrised.
     """
 
