@@ -101,7 +101,7 @@ def test_an_offset_depends_on_nothing_and_without_an_encoder_place_and_speed_are
         return {d.variable: d.share for d in found}
 
     def variables(shares: dict[str, float]) -> set[str]:
-        return set(shares) - {"frequency", "friction_by_position"}
+        return set(shares) - {"frequency", "friction_by_position", "inertia_by_position"}
 
     both = ("encoder_position", "motor_current")
     assert max(shares(lambda c: np.full_like(c, 0.2), features, *both).values()) < 1e-6
@@ -120,7 +120,9 @@ def test_what_brakes_at_a_place_both_ways_is_told_though_its_mean_there_is_nothi
     velocity = np.concatenate([np.full(200, 0.3), np.full(200, -0.3)])
     rubs = 0.2 * np.sign(velocity) * np.exp(-(((position - 0.6) / 0.08) ** 2))
     states = {"position": [position[None]], "velocity": [velocity[None]], "direction": [velocity[None]]}
-    shares = {d.variable: d for d in _dependences({"drive_force": [rubs[None]]}, states, "drive_force")}
+    shares = {
+        d.variable: d for d in _dependences({"drive_force": [rubs[None]]}, states, "drive_force", [0.01])
+    }
     assert shares["friction_by_position"].share > 0.7 and shares["position"].share < 0.05
     curve = shares["friction_by_position"]
     assert curve.centres[int(np.argmax(curve.curve))] == pytest.approx(0.6, abs=0.08)

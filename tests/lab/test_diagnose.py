@@ -409,7 +409,8 @@ def test_an_effect_outside_the_catalogue_is_called_unknown(tmp_path: Path) -> No
     found = diagnose(prepared, effect_sources(model=prepared.model), max_effects=1)
     assert found.verdict == "unknown"
     assert "not in the catalogue" in found.summary
-    variables = {"position", "velocity", "direction", "load", "time", "friction_by_position"}
+    variables = {"position", "velocity", "direction", "load", "time"}
+    variables |= {"friction_by_position", "inertia_by_position"}
     assert {d.variable for d in found.depends_on} == variables
 
 

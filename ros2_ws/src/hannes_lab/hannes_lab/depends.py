@@ -1,4 +1,5 @@
-"""What the residual depends on: position, velocity, direction, load, time, friction by position, or one frequency."""
+"""What the residual depends on: position, velocity, direction, load, time, friction or inertia by position, or one
+frequency."""
 
 from __future__ import annotations
 
@@ -20,8 +21,11 @@ FREQUENCY = "frequency"
 BRAKING = "friction_by_position"
 """What acts against the motion, by where: its mean over both directions is nothing."""
 
+INERTIA = "inertia_by_position"
+"""What goes with the acceleration, by where: of an inertia that depends on the position."""
+
 BINS = 10
-OF_PLACE = {"position": 4, BRAKING: 2}
+OF_PLACE = {"position": 4, BRAKING: 2, INERTIA: 2}
 """Times as many bins: what acts at a place does so on a small part of the way."""
 
 BAND = 1.15
@@ -42,7 +46,7 @@ FEWEST = 16
 ROUNDING = 1e-12
 """Part of a residual's square below which it does not vary."""
 
-WORTH_SAYING = {FREQUENCY: 0.2, BRAKING: 0.2, "position": 0.4}
+WORTH_SAYING = {FREQUENCY: 0.2, BRAKING: 0.2, "position": 0.4, INERTIA: 0.35}
 """Share from which it is said in words; much goes with the position in part."""
 
 ABOVE = 2.0
@@ -57,7 +61,8 @@ class Dependence:
 
     share    part of the variance of the closures' mean residual that the curve explains (adjusted R2), 0..1; an offset
              that is the same everywhere depends on nothing
-    centres  (b,) of the variable, in `unit`; curve (b,) mean residual, in the signal's unit; of a frequency amplitudes
+    centres  (b,) of the variable, in `unit`; curve (b,) mean residual, in the signal's unit; of a frequency amplitudes,
+             of inertia by position for an acceleration of 1
     unit     of the variable; of time and direction none
     at       where it oscillates in all conditions, or where what acts at a place is largest; in `unit`
     """
@@ -121,8 +126,17 @@ def residual_dependences(
     of_signal = {b.signal: b.unit for b in features.blocks}
     place_unit = of_signal.get("encoder_position", "")
     speed_unit = f"{place_unit}/s" if place_unit else ""
-    units = {"position": place_unit, BRAKING: place_unit, "velocity": speed_unit, "load": of_signal[signal]}
-    found = [*_dependences(residuals, known, signal, units), *_oscillation(signal, residuals[signal], steps)]
+    units = {
+        "position": place_unit,
+        BRAKING: place_unit,
+        INERTIA: place_unit,
+        "velocity": speed_unit,
+        "load": of_signal[signal],
+    }
+    found = [
+        *_dependences(residuals, known, signal, steps, units),
+        *_oscillation(signal, residuals[signal], steps),
+    ]
     return tuple(sorted(found, key=lambda d: -d.share))
 
 
@@ -141,6 +155,11 @@ def pointed_at(found: Sequence[Dependence]) -> str:
                 f"{what} oscillates at {where} in all conditions, at whatever speed: something swings that the model "
                 "takes for rigid (a shaft, a belt, a mount, what hangs); examples/effects/elastic_load.py is an effect "
                 "for it"
+            )
+        if first.variable == INERTIA:
+            return (
+                f"{what} goes with the acceleration by where it is: an inertia that depends on the position (a "
+                "crank, a linkage); examples/effects/position_inertia.py is an effect for it"
             )
         if first.at in (first.centres[0], first.centres[-1]):
             continue
@@ -235,13 +254,14 @@ def _dependences(
     residuals: Mapping[str, list[Array]],
     states: Mapping[str, list[Array]],
     signal: str,
+    steps: Sequence[float],
     units: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[Dependence, ...]:
     """Shares of one signal's residual, by variable.
 
     residuals  signal -> per condition block (n, p) measured - model
     states     variable -> per condition block (n, p)
-    units      of the variables
+    steps      s between two phases of each block; units of the variables
     """
     r = np.concatenate([a.mean(axis=0) for a in residuals[signal]])
     out = []
@@ -270,6 +290,14 @@ def _dependences(
             most = braking.centres[int(np.argmax(np.abs(braking.curve)))]
             braking = replace(braking, at=most)
         out.append(braking)
+        # Of few samples between two turns no acceleration is known.
+        acceleration = np.concatenate(
+            [np.gradient(a.mean(axis=0), step) for a, step in zip(states["velocity"], steps, strict=True)]
+        )
+        heavy = _dependence(INERTIA, signal, position, r - r.mean(), acceleration)
+        if heavy.curve:
+            heavy = replace(heavy, at=heavy.centres[int(np.argmax(np.abs(heavy.curve)))])
+        out.append(heavy)
     return tuple(replace(found, unit=units.get(found.variable, "")) for found in out)
 
 
@@ -279,8 +307,8 @@ def _direction(velocity: Array) -> Array:
     return way
 
 
-def _dependence(variable: str, signal: str, x: Array, y: Array, direction: Array | float = 1.0) -> Dependence:
-    """Of a residual y (n,) against a variable x (n,); with a direction (n,) the curve is that of y against it."""
+def _dependence(variable: str, signal: str, x: Array, y: Array, times: Array | float = 1.0) -> Dependence:
+    """Of a residual y (n,) against a variable x (n,): the curve c(x) that is nearest in y = times (n,) c(x)."""
     if variable == "direction":
         labels = _direction(x)
         groups = np.unique(labels)
@@ -292,17 +320,17 @@ def _dependence(variable: str, signal: str, x: Array, y: Array, direction: Array
             return Dependence(variable, signal, 0.0, (), ())
         index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, edges.size - 2)
         groups = np.arange(edges.size - 1, dtype=np.float64)
-    sign = np.broadcast_to(direction, y.shape)
+    factor = np.broadcast_to(times, y.shape)
     centres, curve, inside = [], [], 0.0
     for k in range(groups.size):
         own = index == k
-        moving = own & (sign != 0.0)
         if not own.any():
             continue
-        height = float((sign[moving] * y[moving]).mean()) if moving.any() else 0.0
+        weight = float((factor[own] ** 2).sum())
+        height = float((factor[own] * y[own]).sum()) / weight if weight > 0.0 else 0.0
         centres.append(float(x[own].mean()))
         curve.append(height)
-        inside += float(((y[own] - sign[own] * height) ** 2).sum())
+        inside += float(((y[own] - factor[own] * height) ** 2).sum())
     total, level = float(((y - y.mean()) ** 2).sum()), float((y**2).sum())
     k, n = len(centres), y.size
     # Of an offset alone rounding is left.

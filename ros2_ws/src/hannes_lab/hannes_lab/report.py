@@ -24,6 +24,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from . import report_text as text
+from .depends import INERTIA
 from .diagnosis import has_excess
 from .experiments import VISIBLE
 from .falls import WITHOUT_EFFECT, before, before_in_units, errors_in_units, step_name
@@ -552,7 +553,7 @@ def dependences(comparison: Part | None, after: Part | None, diagnosis: Part | N
                 "name": name,
                 "where": where,
                 "signal": signal,
-                "unit": signal_unit,
+                "unit": f"{signal_unit}/({unit}/s2)" if name == INERTIA else signal_unit,
                 "variable_unit": unit,
                 "shares": {kind: d.get("share") for kind, d in sources},
                 "svg": curve_svg(curves, steps=steps) if len(xs) > 1 else None,
