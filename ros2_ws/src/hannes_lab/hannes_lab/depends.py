@@ -25,7 +25,7 @@ INERTIA = "inertia_by_position"
 """What goes with the acceleration, by where: of an inertia that depends on the position."""
 
 BINS = 10
-OF_PLACE = {"position": 4, BRAKING: 2, INERTIA: 2}
+OF_PLACE = {"position": 4, BRAKING: 2}
 """Times as many bins: what acts at a place does so on a small part of the way."""
 
 BAND = 1.15
