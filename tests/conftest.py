@@ -31,20 +31,8 @@ DOMAIN_LOCK_PORT = 24300
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Modules with slow tests first, so that at the end no process waits for another one's; and modules of nodes, which
-    mostly wait for each other, spread among those that compute, so that all cores have work."""
-    modules: dict[Path, list[pytest.Item]] = {}
-    for item in items:
-        modules.setdefault(item.path, []).append(item)
-    slow = {path for path, own in modules.items() if any(item.get_closest_marker("slow") for item in own)}
-    wait = {
-        path for path, own in modules.items() if any("ros_domain_id" in item.fixturenames for item in own)
-    }  # type: ignore[attr-defined]
-    order = []
-    for kind in (modules.keys() - wait, wait):
-        ranked = sorted((path for path in modules if path in kind), key=lambda path: path not in slow)
-        order += [((k + 0.5) / len(ranked), path) for k, path in enumerate(ranked)]
-    items[:] = [item for _, path in sorted(order) for item in modules[path]]
+    """The slow tests, and with them their modules, first: at the end no process waits for another one's."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
 @pytest.fixture(scope="session")

@@ -628,7 +628,7 @@ def test_an_effect_that_explains_most_and_foretells_nothing_is_named_in_a_note()
             best=SimpleNamespace(names=names),
             search=SimpleNamespace(problem=SimpleNamespace(features=features)),
         )
-        return unforetold(choice)  # type: ignore[arg-type]
+        return unforetold(choice)
 
     (note,) = told(0.91)
     assert note.startswith("cogging alone explains 91 %") and "hannes add --effect cogging" in note

@@ -282,7 +282,7 @@ def report(
 def _model_file(found: Diagnosis | Addition, path: Path) -> Output:
     nearest = isinstance(found, Diagnosis) and found.verdict == "unknown" and found.effects
     remarks = ["of the nearest effects, which are no finding"] if nearest else []
-    left_out = sorted({n.partition("@")[0] for n in found.values if n not in found.model.names})
+    left_out = sorted({name.partition("@")[0] for name in found.model.provenance["recordings"]})
     if left_out:
         remarks.append(f"without what is of the recordings: {', '.join(left_out)}")
     return Output(

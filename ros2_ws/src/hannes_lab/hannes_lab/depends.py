@@ -277,28 +277,25 @@ def _dependences(
             values = np.concatenate([a.mean(axis=0) for a in states[variable]])
             target = r
         one = _dependence(variable, signal, values, target)
-        if variable == "position" and one.curve:
-            away = np.abs(np.subtract(one.curve, np.mean(one.curve)))
-            one = replace(one, at=one.centres[int(np.argmax(away))])
-        out.append(one)
+        out.append(_with_place(one, float(np.mean(one.curve or 0.0))) if variable == "position" else one)
     if "position" in states and "velocity" in states:
         position, velocity = (
             np.concatenate([a.mean(axis=0) for a in states[name]]) for name in ("position", "velocity")
         )
-        braking = _dependence(BRAKING, signal, position, r - r.mean(), _direction(velocity))
-        if braking.curve:
-            most = braking.centres[int(np.argmax(np.abs(braking.curve)))]
-            braking = replace(braking, at=most)
-        out.append(braking)
+        out.append(_with_place(_dependence(BRAKING, signal, position, r - r.mean(), _direction(velocity))))
         # Of few samples between two turns no acceleration is known.
         acceleration = np.concatenate(
             [np.gradient(a.mean(axis=0), step) for a, step in zip(states["velocity"], steps, strict=True)]
         )
-        heavy = _dependence(INERTIA, signal, position, r - r.mean(), acceleration)
-        if heavy.curve:
-            heavy = replace(heavy, at=heavy.centres[int(np.argmax(np.abs(heavy.curve)))])
-        out.append(heavy)
+        out.append(_with_place(_dependence(INERTIA, signal, position, r - r.mean(), acceleration)))
     return tuple(replace(found, unit=units.get(found.variable, "")) for found in out)
+
+
+def _with_place(found: Dependence, level: float = 0.0) -> Dependence:
+    """The same with where its curve is farthest from a level."""
+    if not found.curve:
+        return found
+    return replace(found, at=found.centres[int(np.argmax(np.abs(np.subtract(found.curve, level))))])
 
 
 def _direction(velocity: Array) -> Array:

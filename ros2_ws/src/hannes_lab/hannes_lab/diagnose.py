@@ -152,8 +152,8 @@ def diagnose(
     best = search.with_spread(best)
     intervals = spans_of(search, best, limits, falls)
     effects = found_effects(search, best, intervals, falls)
-    clock = other_clock(search.problem, best.fit) if greedy or verdict == "unknown" else None
     unknown = verdict == "unknown"
+    clock = other_clock(search.problem, best.fit) if greedy or unknown else None
     lost = unforetold(choice) if greedy and unknown else ()
     kind = unknown_kind(search, effects, choice, answer.bent, only, bool(lost)) if unknown else ""
     depends_on = residual_dependences(
@@ -200,7 +200,7 @@ def diagnose(
             *lost,
             *prepared.notes,
             *choice.notes,
-            *((choice.left,) if choice.left and verdict != "unknown" else ()),
+            *((choice.left,) if choice.left and not unknown else ()),
             *notes(search, best, verdict, effects, experiments, greedy, clock),
             *worse_fitted(falls),
         ),
@@ -297,12 +297,12 @@ def _borne_out(choice: Choice, null: Candidate, falls: tuple[Fall, ...]) -> tupl
         falls, alone = falls[:-1], True
         best = search.with_spread(search.fit_of(best.names[:-1]))
     deciding = deciding_errors(falls)
-    given = before(deciding) != NOMINAL_FITTED
-    if not alone and not (given and best.names):
+    first = before(deciding)
+    if not alone and (first == NOMINAL_FITTED or not best.names):
         return choice, falls
     if alone:
         choice = replace(choice, best=best, rivals=(), notes=notes)
-    return judged_by_conditions(choice, null, deciding[before(deciding)], deciding[-1]), falls
+    return judged_by_conditions(choice, null, deciding[first], deciding[-1]), falls
 
 
 def _idle_at_the_end(

@@ -139,10 +139,15 @@ def relative_errors(falls: Sequence[Fall]) -> list[float]:
 
     It needs no repeatability; NaN where no condition could be held out.
     """
-    base = falls[NOMINAL_FITTED].held_out_signals
+    return _relative([fall.held_out_signals for fall in falls])
+
+
+def _relative(steps: Sequence[Mapping[str, float]]) -> list[float]:
+    """Errors by signal of each step over those of the fitted nominal model, root mean square; NaN of none."""
+    base = steps[NOMINAL_FITTED]
     out = []
-    for fall in falls:
-        ratios = [fall.held_out_signals.get(s, np.nan) / error for s, error in base.items() if error > 0.0]
+    for errors in steps:
+        ratios = [errors.get(s, np.nan) / error for s, error in base.items() if error > 0.0]
         out.append(float(np.sqrt(np.mean(np.square(ratios)))) if ratios else float("nan"))
     return out
 
@@ -229,9 +234,7 @@ def errors_in_units(falls: Sequence[Mapping[str, Any]]) -> tuple[bool, list[dict
 
 def before_in_units(steps: Sequence[Mapping[str, float]]) -> int:
     """The same of errors by signal, each in its unit (errors_in_units): by their ratios to the fitted nominal's."""
-    given, fitted = steps[0], steps[NOMINAL_FITTED]
-    ratios = [given[s] / error for s, error in fitted.items() if s in given and error > 0.0]
-    return before([float(np.sqrt(np.mean(np.square(ratios)))) if ratios else np.nan, 1.0])
+    return before(_relative(steps))
 
 
 def _in_units(falls: Sequence[Fall]) -> str:
