@@ -239,8 +239,7 @@ def _closures(trial: Trial, where: str) -> tuple[Closure, ...]:
     begins = np.array([part.begin for part in trial.parts])
     if begins.size and not (np.diff(begins) > 0.0).all():
         raise HannesError(f"{where}: its parts must begin one after the other.")
-    # A closure's middle tells its part: it may begin a moment before.
-    of = [int(np.searchsorted(begins, 0.5 * (c.start + c.stop), side="right")) for c in closures]
+    of = [trial.part_of(c) for c in closures]
     if len({(c.number, part) for c, part in zip(closures, of, strict=True)}) == len(closures):
         return closures
     return tuple(replace(c, number=of[:k].count(of[k])) for k, c in enumerate(closures))

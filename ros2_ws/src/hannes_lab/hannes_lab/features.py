@@ -343,7 +343,7 @@ def stands_for_all(trial: Trial) -> bool:
     """False where parts begin anew, but a simulation of the first would not be one of the others."""
     if not trial.anew:
         return True
-    later = [c for c in trial.closures if 0.5 * (c.start + c.stop) > trial.parts[1].begin]
+    later = [c for c in trial.closures if trial.part_of(c) > 0]
     return not later or compact_end(trial) is not None
 
 
@@ -413,10 +413,9 @@ def _block(
 
 def _own_samples(trial: Trial, closure: Closure, time: Array) -> tuple[int, int]:
     """Numbers of the first and the last sample of the recording that a closure of a joined trial is of."""
-    begins = np.array([part.begin for part in trial.parts]) - 1e-9
-    part = int(np.searchsorted(begins, 0.5 * (closure.start + closure.stop), side="right")) - 1
+    begins, part = [part.begin - 1e-9 for part in trial.parts], trial.part_of(closure)
     first = int(np.searchsorted(time, begins[part])) if part > 0 else 0
-    last = int(np.searchsorted(time, begins[part + 1])) if part + 1 < begins.size else time.size
+    last = int(np.searchsorted(time, begins[part + 1])) if part + 1 < len(begins) else time.size
     return first, last - 1
 
 

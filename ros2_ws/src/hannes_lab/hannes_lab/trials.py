@@ -180,6 +180,11 @@ class Trial:
     def unit(self, signal: str) -> str:
         return self.units.get(signal, UNITS.get(signal, ""))
 
+    def part_of(self, closure: Closure) -> int:
+        """Number of the part that a closure is of, which its middle tells: it may begin a moment before; 0 of none."""
+        middle = 0.5 * (closure.start + closure.stop)
+        return max(0, sum(part.begin <= middle for part in self.parts) - 1)
+
     @property
     def conditions(self) -> tuple[str, ...]:
         """Names of the conditions, in the order of their first closure."""
