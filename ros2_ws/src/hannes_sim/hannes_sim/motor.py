@@ -63,6 +63,13 @@ from .ports import (
 _compiled = njit(cache=True, error_model="numpy")
 """Divisions without Python's check for 0, which takes time: what is not finite is seen in the reading."""
 
+_inlined = njit(cache=True, error_model="numpy", inline="always")
+"""The same as part of its caller's loop: a call there costs a sixth of a step."""
+
+SAME_RATE = 1e-5
+"""Part of the winding's decay over a step by which it may be off: a motor that warms up changes it a little with every
+step, and what follows from it takes long."""
+
 FASTEST = 1e4
 """rad/s or m/s; a machine that is faster has diverged, whatever its effects give."""
 
@@ -71,10 +78,12 @@ FASTEST = 1e4
 def evaluate_effects(handle):  # type: ignore[no-untyped-def]
     """Sum the contributions of all active effects into the outputs; the inputs must be filled before."""
     x, y = handle[H_INPUTS], handle[H_OUTPUTS]
+    table = pointer_i8(handle[H_EFFECTS])
+    if table[0] == 0:
+        return  # the outputs are zero since the reset
     out = pointer_f8(y)
     for k in range(N_OUTPUTS):
         out[k] = 0.0
-    table = pointer_i8(handle[H_EFFECTS])
     for k in range(table[0]):
         call_effect(table[1 + 3 * k], x, table[2 + 3 * k], table[3 + 3 * k], y)
 
@@ -94,9 +103,9 @@ def watch_outputs(handle, place, speed):  # type: ignore[no-untyped-def]
         pointer_f8(handle[H_STATE])[S_UNDEFINED] = 1.0
 
 
-@_compiled
+@_inlined
 def begin_step(handle, voltage, q, v):  # type: ignore[no-untyped-def]
-    """Time, delayed and limited command, and motor position into the inputs; returns nothing.
+    """Time, delayed and limited command [V], and motor position into the inputs; returns the command.
 
     The delay is the parameter plus the effects' DELAY of the previous step, interpolated between the stored
     commands (one a step), so that it is continuous in the delay.
@@ -124,11 +133,12 @@ def begin_step(handle, voltage, q, v):  # type: ignore[no-untyped-def]
     x[VOLTAGE] = command
     x[RESISTANCE] = p[P_RESISTANCE]
     x[SUPPLY] = limit
+    return command
 
 
-@_compiled
-def motor_torque(handle):  # type: ignore[no-untyped-def]
-    """Torque at the pulley [N.m] of the brushed motor after this step.
+@_inlined
+def motor_torque(handle, command, v):  # type: ignore[no-untyped-def]
+    """Torque at the pulley [N.m] of the brushed motor after a step of a command [V] at a speed v [rad/s].
 
     L di/dt = u - R i - Ke w, integrated exactly over the step for constant u and w (the electrical time constant,
     about 0.1 ms, is shorter than a step); torque = efficiency kt ratio i, with the mean current of the step so that
@@ -138,14 +148,14 @@ def motor_torque(handle):  # type: ignore[no-untyped-def]
     current in units of its gain.
     """
     p, s = pointer_f8(handle[H_PARAMETERS]), pointer_f8(handle[H_STATE])
-    x, y = pointer_f8(handle[H_INPUTS]), pointer_f8(handle[H_OUTPUTS])
+    y = pointer_f8(handle[H_OUTPUTS])
     kt = p[P_KT] * (1.0 + y[KT_REL])
     resistance = p[P_RESISTANCE] * (1.0 + y[RESISTANCE_REL])
-    drive = x[VOLTAGE] - y[VOLTAGE_DROP] - kt * p[P_RATIO] * x[V] * (1.0 - p[P_EMF_COMPENSATED])
+    drive = command - y[VOLTAGE_DROP] - kt * p[P_RATIO] * v * (1.0 - p[P_EMF_COMPENSATED])
     final = drive * (1.0 / resistance)  # the reciprocal is known before the drive, and divisions take long
     before = s[S_CURRENT]
     rate = resistance / p[P_INDUCTANCE] * p[P_DT] if p[P_INDUCTANCE] > 0.0 else math.inf
-    if rate != s[S_RATE]:
+    if abs(rate - s[S_RATE]) > SAME_RATE * rate:
         s[S_RATE] = rate
         s[S_DECAY] = math.exp(-rate)
         s[S_MEAN] = (1.0 - s[S_DECAY]) / rate

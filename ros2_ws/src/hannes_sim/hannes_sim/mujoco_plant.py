@@ -94,6 +94,7 @@ from .ports import (
     R_LOAD,
     R_Q,
     R_QL,
+    R_VL,
     R_WARNING,
     S_CONTACT,
     S_LOAD,
@@ -184,11 +185,11 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
                 bad = 1.0 + j
         if k == steps or bad != 0.0:
             break
-        begin_step(handle, voltage, q, v)
+        command = begin_step(handle, voltage, q, v)
         x[QL], x[VL], x[LOAD], x[CONTACT] = ql, vl, s[S_LOAD], s[S_CONTACT]
         evaluate_effects(handle)
         watch_outputs(handle, q + ql, v)
-        torque = motor_torque(handle) + y[TORQUE]
+        torque = motor_torque(handle, command, v) + y[TORQUE]
         level = max(0.0, p[_COULOMB] + y[FRICTION]) / r
         viscous = max(0.0, p[_VISCOUS] + y[DAMPING]) / (r * r)
 
@@ -231,7 +232,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
 
     sense(handle, q, steps)
     out[R_FORCE] = sensors[count[_C_GRIP]] if count[_C_GRIP] >= 0 else 0.0
-    out[R_Q], out[R_QL], out[R_LOAD] = q, ql, s[S_LOAD]
+    out[R_Q], out[R_QL], out[R_LOAD], out[R_VL] = q, ql, s[S_LOAD], vl
     for j in range(N_JOINTS):
         out[R_JOINTS + j] = qpos[count[_C_JOINTS + j]]
         out[R_JOINTS + N_JOINTS + j] = qvel[count[_C_JOINTS + j]]
@@ -608,6 +609,9 @@ class MujocoPlant:
             dof = int(np.argmax(np.abs(np.nan_to_num(d.qvel, nan=np.inf))))
         dof = min(max(dof, 0), m.nv - 1)
         return str(m.joint(int(m.dof_jntid[dof])).name)
+
+    def show_joints(self, readings: NDArray[np.float64]) -> None:
+        """Nothing to do: they are read with all else."""
 
     def read(self) -> Reading:
         return Reading.of(self.reading)

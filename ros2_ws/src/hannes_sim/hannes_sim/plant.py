@@ -88,7 +88,7 @@ class Plant(Protocol):
     dt             s, integration step
     address        address of the compiled `advance(handle, voltage, steps)`
     handle         int64 addresses of the plant's buffers (ports.H_*)
-    reading        float64 (N_READING,), filled by every advance
+    reading        float64 (N_READING,), filled by every advance, but for the joints where show_joints gives them
     """
 
     dt: float
@@ -101,6 +101,9 @@ class Plant(Protocol):
 
     def advance(self, voltage: float, steps: int) -> None:
         """Hold the voltage [V] for `steps` steps of dt; raises PlantDiverged, HannesError where an effect raises."""
+
+    def show_joints(self, readings: NDArray[np.float64]) -> None:
+        """Fill the finger joints of readings (n, N_READING) where `advance`, to be fast, left them out."""
 
     def read(self) -> Reading:
         """The sensors now."""

@@ -52,8 +52,9 @@ R_FORCE = 5  # N, total fingertip force on the object
 R_Q = 6  # rad, true motor side position
 R_QL = 7  # rad, true load side position
 R_LOAD = 8  # N.m, true transmitted torque
-R_WARNING = 9  # 0 fine, UNDEFINED, or another number of the plant's where it diverged
-R_JOINTS = 10  # rad, 13 finger joints, then 13 velocities in rad/s
+R_VL = 9  # rad/s, true load side velocity
+R_WARNING = 10  # 0 fine, UNDEFINED, or another number of the plant's where it diverged
+R_JOINTS = 11  # rad, 13 finger joints, then 13 velocities in rad/s
 N_JOINTS = 13
 N_READING = R_JOINTS + 2 * N_JOINTS
 

@@ -74,6 +74,7 @@ from .ports import (
     R_LOAD,
     R_Q,
     R_QL,
+    R_VL,
     R_WARNING,
     S_CONTACT,
     S_LOAD,
@@ -134,10 +135,10 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
     q, v, ql, vl = s[_SQ], s[_SV], s[_SQL], s[_SVL]
     place, speed, load, contact = q + ql, v, s[S_LOAD], s[S_CONTACT]
     for _ in range(steps):
-        begin_step(handle, voltage, q, v)
+        command = begin_step(handle, voltage, q, v)
         x[QL], x[VL], x[LOAD], x[CONTACT] = ql, vl, load, contact
         evaluate_effects(handle)
-        torque = motor_torque(handle) + y[TORQUE]
+        torque = motor_torque(handle, command, v) + y[TORQUE]
 
         if p[_WIRE_K] > 0.0:
             stretch = q - ql - y[SLACK]
@@ -180,12 +181,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
     watch_outputs(handle, place, speed)  # once a control period: what an effect cannot give lasts
     sense(handle, q, steps)
     out[R_FORCE] = contact / p[_TIP] if p[_TIP] > 0.0 else 0.0
-    out[R_Q], out[R_QL], out[R_LOAD] = q, ql, load
-    if p[_TRAVEL] > 0.0:
-        share, rate = ql / p[_TRAVEL], vl / p[_TRAVEL]
-        for j in range(N_JOINTS):
-            out[R_JOINTS + j] = share * _CLOSED[j]
-            out[R_JOINTS + N_JOINTS + j] = rate * _CLOSED[j]
+    out[R_Q], out[R_QL], out[R_LOAD], out[R_VL] = q, ql, load, vl
     out[R_WARNING] = 0.0 if math.isfinite(q) and math.isfinite(ql) and abs(v) < 1e6 else 1.0
     if s[S_UNDEFINED] > 0.0:
         out[R_WARNING] = UNDEFINED
@@ -351,5 +347,12 @@ class ReducedPlant:
                 f"({which}); reduce dt or check the parameters' magnitudes."
             )
 
+    def show_joints(self, readings: NDArray[np.float64]) -> None:
+        """All joints close alike, in proportion to the hand coordinate; they stand still where there is no hand."""
+        if travel := self.parameters[_TRAVEL]:
+            moved = readings[:, [R_QL, R_VL]] / travel
+            readings[:, R_JOINTS:] = (moved[:, :, np.newaxis] * _CLOSED).reshape(-1, 2 * N_JOINTS)
+
     def read(self) -> Reading:
+        self.show_joints(self.reading[np.newaxis])
         return Reading.of(self.reading)

@@ -239,6 +239,8 @@ def rollout(
             f"The controller returned a non-finite voltage at t = {done * controller.period:.3f} s; "
             "check its gains."
         )
+    if joints:
+        plant.show_joints(out)
     return Rollout(out[:, R_TIME].copy(), reference, voltages, out)
 
 

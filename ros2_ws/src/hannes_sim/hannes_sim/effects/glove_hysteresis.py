@@ -22,12 +22,14 @@ class GloveHysteresis(Effect):
             "relaxation", "s", 0.02, 20.0, 0.5, None, "relaxation time t_r", starts=(0.1, 0.5, 3.0)
         ),
     )
-    states = 1
+    states = 3
     looks_like = "more current while closing, less while holding: the torque relaxes while the hand rests"
     told_by = "a closure held for several relaxation times, at two speeds"
 
     @staticmethod
     def contribute(x: Any, p: Any, s: Any, y: Any) -> None:
-        decay = math.exp(-x[DT] / p[1])
-        s[0] = s[0] * decay + p[0] * p[1] * (1.0 - decay) * x[VL]
+        rate = x[DT] / p[1]
+        if rate != s[1]:
+            s[1], s[2] = rate, math.exp(-rate)  # once a run: it takes longer than the rest
+        s[0] = s[0] * s[2] + p[0] * p[1] * (1.0 - s[2]) * x[VL]
         y[LOAD_TORQUE] -= s[0]
