@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hannes_lab import choose as module
 from hannes_lab.chance import Chance
-from hannes_lab.choose import OWN_ERROR_PART, Choice, _hard, choose, choose_greedily
+from hannes_lab.choose import OWN_ERROR_PART, Choice, _thoroughly, choose, choose_greedily
 from hannes_lab.diagnose import _behind_the_law
 from hannes_lab.search import PENALTY, Candidate
 from hannes_lab.wording import nearest_sentence
@@ -144,21 +144,29 @@ def test_what_another_machines_law_had_hidden_is_looked_for(
     assert alike.best.names == ("a",)
 
 
-def test_a_machine_far_off_is_looked_at_thoroughly_though_it_explains_all(given: pytest.MonkeyPatch) -> None:
-    def made_at(cost: float, **flags: bool) -> Any:
-        return SimpleNamespace(fit=SimpleNamespace(cost=cost), names=(), **flags)
+def test_what_is_tried_thoroughly_is_all_of_a_machine_far_off_else_the_best_that_explains_too_little(
+    given: pytest.MonkeyPatch,
+) -> None:
+    def made_at(cost: float, *names: str, **flags: bool) -> Any:
+        return SimpleNamespace(fit=SimpleNamespace(cost=cost), names=names, **flags)
 
-    def hard(cost: float, other: bool = True, slow: bool = False, **flags: bool) -> bool:
+    def tried(
+        cost: float, other: bool = True, slow: bool = False, best: float = 2000.0, **flags: bool
+    ) -> str:
         flags = {"far_off": False, "pulled": False, **flags}
-        search: Any = SimpleNamespace(slow=slow, problem=SimpleNamespace(discrepancy=other))
+        search: Any = SimpleNamespace(
+            slow=slow, problem=SimpleNamespace(discrepancy=other), sources=("a", "b")
+        )
         choice = Choice(search, made_at(cost, **flags), LIMITS, cost <= LIMITS.misfit, ())
-        return _hard(choice, made_at(2000.0))
+        return "".join(_thoroughly(choice, made_at(best, "b")))
 
-    assert hard(900.0, far_off=True) and not hard(900.0)
-    assert not hard(900.0, far_off=True, slow=True)
-    assert not hard(900.0, other=False, far_off=True, pulled=True), "chance explains all there"
-    assert hard(2000.0, pulled=True) and not hard(2000.0, far_off=True)
-    assert hard(2000.0, other=False, pulled=True) and not hard(2000.0, other=False)
+    assert tried(900.0, far_off=True) == "ab" and tried(900.0) == ""
+    assert tried(900.0, far_off=True, slow=True) == ""
+    assert tried(900.0, other=False, far_off=True, pulled=True) == "", "chance explains all there"
+    assert tried(2000.0, pulled=True) == "ab" and tried(2000.0, far_off=True) == "b"
+    assert tried(2000.0, other=False, pulled=True) == "ab"
+    assert tried(2000.0, other=False) == "b", "where the fit of the best has ended may not be where it leads"
+    assert tried(2000.0, other=False, pulled=True, best=900.0) == "", "it explains all"
 
 
 def test_what_was_asked_of_the_nearest_effect_is_said(given: pytest.MonkeyPatch) -> None:
@@ -177,7 +185,7 @@ def test_effects_that_only_replace_what_the_model_had_are_no_answer(
     """However much of the error on conditions that were left out they take."""
     best = made(("a",), 500.0, 5.0)
     grown = SimpleNamespace(best=best, first=(best,), errors=(4.0, 1.1), rivals=(), notes=())
-    given.setattr(module, "grow", lambda *args: grown)
+    given.setattr(module, "grown_straight", lambda *args: grown)
     given.setattr(module, "disbelieved", lambda search, c: why if reason == "disbelieved" else "")
     given.setattr(module, "led_off", lambda base, c: why if reason == "led_off" else "")
     choice = choose_greedily(search_of(NULL, best), NULL, LIMITS, 3)

@@ -134,10 +134,13 @@ def _travel(trial: Trial) -> float:
     return trial.span
 
 
-def distorted(search: Search, candidate: Candidate) -> str:
-    """The effect of less than one wave, or of few whose shapes are farther off than DISTORTED, in words; or empty."""
+def distorted(search: Search, candidate: Candidate, among: Sequence[str] | None = None) -> str:
+    """The effect of less than one wave, or of few whose shapes are farther off than DISTORTED, in words; or empty.
+
+    among   of these effects only
+    """
     fit = candidate.fit
-    for effect in candidate.names:
+    for effect in candidate.names if among is None else among:
         kind = search.effect(effect)
         period = period_of(kind)
         if period is None:

@@ -12,7 +12,7 @@ from .adequacy import disbelieved, distorted, is_adequate, leads_back, led_off, 
 from .chance import Chance, chance
 from .diagnosis import Rank
 from .features import Features
-from .greedy import AS_IT_REPEATS, JUDGED, grow, held_out_error, largest_error
+from .greedy import AS_IT_REPEATS, JUDGED, grown_straight, held_out_error, largest_error
 from .search import HOPELESS, PENALTY, Candidate, Search, key_of
 
 WORTHWHILE = 0.05
@@ -126,8 +126,8 @@ def choose(
         round_ = _extended(choice, front, far, text, worth)
         if not round_:
             break
-        if first_one and _hard(choice, round_[0]):
-            again = search.thoroughly().extend(front, choice.sought, "one effect, thoroughly", worth)
+        if first_one and (names := _thoroughly(choice, round_[0])):
+            again = search.thoroughly().extend(front, names, "one effect, thoroughly", worth)
             round_ = _best_of(round_, again)
         round_ = [c for c in round_ if not distorted(choice.search, c)] or round_
         if enough and round_[0].penalised < worth and set(choice.best.names) < set(round_[0].names):
@@ -191,7 +191,7 @@ def must_be_held_out(features: Features) -> None:
 
 def choose_greedily(search: Search, null: Candidate, limits: Chance, max_effects: int) -> Choice:
     """Effects one after another while the mean square error on held-out conditions falls by at least EACH_TAKES."""
-    grown = grow(search, null, max_effects, EACH_TAKES)
+    grown = grown_straight(search, null, max_effects, EACH_TAKES)
     ranking = tuple(Rank.of(c, _share(null, c, limits.median)) for c in grown.first)
     choice = Choice(search, grown.best, limits, False, ranking, grown.rivals, grown.notes)
     return judged_by_conditions(choice, null, grown.errors[0], grown.errors[-1])
@@ -238,17 +238,21 @@ def halved(first: float, last: float) -> bool:
     return last - 1.0 <= HALF * (first - 1.0)
 
 
-def _hard(choice: Choice, first: Candidate) -> bool:
-    """Whether effects must be tried thoroughly: the model as it is went far off, and no effect explains enough.
+def _thoroughly(choice: Choice, first: Candidate) -> Sequence[str]:
+    """Which effects must be tried thoroughly.
 
-    Where the model has an error of its own, much is explained by what is wrong, and a machine that is far off may
-    explain all: then always.
+    All, where the model as it is went far off and no effect explains enough.  Where the model has an error of its own,
+    much is explained by what is wrong, and a machine that is far off may explain all: then always.  Else the best, if
+    it does not explain all: where its fit has ended may not be where it leads.
     """
     if choice.search.slow:
-        return False
+        return ()
+    adequate = choice.adequate or is_adequate(choice.search, first, choice.limits)
     if choice.search.problem.discrepancy:
-        return choice.best.far_off if choice.adequate else choice.best.pulled
-    return choice.best.pulled and not (choice.adequate or is_adequate(choice.search, first, choice.limits))
+        hard = choice.best.far_off if choice.adequate else choice.best.pulled
+    else:
+        hard = choice.best.pulled and not adequate
+    return choice.sought if hard else () if adequate else first.names
 
 
 def _ended_early(size: int, left: float, best: Candidate, limits: Chance) -> str:

@@ -49,6 +49,9 @@ ROUNDING = 1e-12
 WORTH_SAYING = {FREQUENCY: 0.2, BRAKING: 0.2, "position": 0.4, INERTIA: 0.35}
 """Share from which it is said in words; much goes with the position in part."""
 
+SHOWN = 0.2
+"""Share of a place from which it is told that less of it is alike in all passes."""
+
 ABOVE = 2.0
 """Times that a mean residual's square must exceed what the closures' scatter makes of it, to show a frequency."""
 AT_REST = 1e-3
@@ -65,6 +68,8 @@ class Dependence:
              of inertia by position for an acceleration of 1
     unit     of the variable; of time and direction none
     at       where it oscillates in all conditions, or where what acts at a place is largest; in `unit`
+    repeated  of a place: part of the variance that is alike in all passes of it, either way (of inertia, and in all
+             conditions); what is passed once only goes with the place whatever the cause
     """
 
     variable: str
@@ -74,15 +79,24 @@ class Dependence:
     curve: tuple[float, ...]
     unit: str = ""
     at: float | None = None
+    repeated: float = 0.0
 
     @property
     def said(self) -> str:
         """The variable and its share, in words."""
         where = "" if self.at is None or self.share == 0.0 else f" ({self.at:.2g} {self.unit})"
-        return f"{self.variable.replace('_', ' ')}{where} {100 * self.share:.0f} %"
+        share = f"{100 * self.share:.0f} %"
+        if self.variable in (*OF_PLACE, INERTIA) and self.share >= SHOWN > self.repeated:
+            share += f" ({100 * self.repeated:.0f} % alike in all passes)"
+        return f"{self.variable.replace('_', ' ')}{where} {share}"
 
     def to_dict(self) -> dict[str, Any]:
         where = {} if self.at is None else {"at": self.at}
+        where |= (
+            {"repeated": self.repeated}
+            if self.variable in WORTH_SAYING and self.variable != FREQUENCY
+            else {}
+        )
         return where | {
             "variable": self.variable,
             "unit": self.unit,
@@ -143,12 +157,14 @@ def residual_dependences(
 def pointed_at(found: Sequence[Dependence]) -> str:
     """A sentence where a residual goes with one frequency, or with a place, as with nothing else; or empty.
 
-    Where the way ends the machine turns, and all that has to do with starts and stops is largest there.
+    A place counts by what is alike in all passes of it.  Where the way ends the machine turns, and all that has to do
+    with starts and stops is largest there.
     """
     for first in sorted(found, key=lambda d: -d.share):
-        if first.at is None or first.share < WORTH_SAYING[first.variable]:
+        worth = first.share if first.variable == FREQUENCY else first.repeated
+        if first.at is None or worth < WORTH_SAYING[first.variable]:
             return ""
-        what = f"{100 * first.share:.0f} % of what is left of {first.signal}"
+        what = f"{100 * worth:.0f} % of what is left of {first.signal}"
         where = f"{first.at:.2g} {first.unit}"
         if first.variable == FREQUENCY:
             return (
@@ -282,12 +298,29 @@ def _dependences(
         position, velocity = (
             np.concatenate([a.mean(axis=0) for a in states[name]]) for name in ("position", "velocity")
         )
-        out.append(_with_place(_dependence(BRAKING, signal, position, r - r.mean(), _direction(velocity))))
         # Of few samples between two turns no acceleration is known.
         acceleration = np.concatenate(
             [np.gradient(a.mean(axis=0), step) for a, step in zip(states["velocity"], steps, strict=True)]
         )
-        out.append(_with_place(_dependence(INERTIA, signal, position, r - r.mean(), acceleration)))
+        way = _direction(velocity)
+        condition = np.repeat(np.arange(len(steps)), [a.shape[1] for a in states["velocity"]])
+        away = r - r.mean()
+        out += [
+            _with_place(_dependence(variable, signal, position, away, times))
+            for variable, times in ((BRAKING, way), (INERTIA, acceleration))
+        ]
+        # What is the same all the way, one way or the other, is friction.
+        level = sum(away[way == one].mean() * (way == one) for one in (-1.0, 1.0) if (way == one).any())
+        passes: dict[str, tuple[Array, Array | float, Array]] = {
+            "position": (away - level, 1.0, way),
+            BRAKING: (away - level, way, way),
+            INERTIA: (away, acceleration, way + 4.0 * condition),
+        }
+        for k, found in enumerate(out):
+            if found.variable in passes:
+                rest, times, group = passes[found.variable]
+                share = _repeated(_bins(found.variable, position), rest, times, group, way != 0.0)
+                out[k] = replace(found, repeated=share * float(rest @ rest) / max(float(away @ away), 1e-300))
     return tuple(replace(found, unit=units.get(found.variable, "")) for found in out)
 
 
@@ -304,6 +337,41 @@ def _direction(velocity: Array) -> Array:
     return way
 
 
+def _bins(variable: str, x: Array) -> NDArray[np.int64]:
+    """The bin (n,) of each value of a variable, as many in one as in another; all 0 where there is but one."""
+    edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, BINS * OF_PLACE.get(variable, 1) + 1)))
+    if edges.size < 3:
+        return np.zeros(x.size, dtype=np.int64)
+    return np.clip(np.searchsorted(edges, x, side="right") - 1, 0, edges.size - 2)
+
+
+def _repeated(
+    index: NDArray[np.int64], y: Array, times: Array | float, group: Array, moving: NDArray[np.bool_]
+) -> float:
+    """Part of the square of a residual y (n,) that times (n,) c(bin) is in all groups alike.
+
+    In each bin the component of variance that its groups have in common (Fisher 1925): their common curve's square,
+    less what groups of which each has a curve of its own would lend it.  Where it stands, and in bins that one group
+    passes alone, nothing repeats.
+    """
+    factor = np.broadcast_to(times, y.shape)
+    common = 0.0
+    for k in np.unique(index[moving]):
+        inside = moving & (index == k)
+        weights, products = [], []
+        for one in np.unique(group[inside]):
+            own = inside & (group == one)
+            weights.append(float(factor[own] @ factor[own]))
+            products.append(float(factor[own] @ y[own]))
+        w, p = np.array(weights), np.array(products)
+        p, w = p[w > ROUNDING * w.sum()], w[w > ROUNDING * w.sum()]
+        if w.size > 1:
+            together, each = float(p.sum() ** 2 / w.sum()), float(np.sum(p**2 / w))
+            common += together - (each - together) / (w.size - 1)
+    total = float(y @ y)
+    return max(0.0, common / total) if total > 0.0 else 0.0
+
+
 def _dependence(variable: str, signal: str, x: Array, y: Array, times: Array | float = 1.0) -> Dependence:
     """Of a residual y (n,) against a variable x (n,): the curve c(x) that is nearest in y = times (n,) c(x)."""
     if variable == "direction":
@@ -311,12 +379,10 @@ def _dependence(variable: str, signal: str, x: Array, y: Array, times: Array | f
         groups = np.unique(labels)
         index: NDArray[np.int64] = np.searchsorted(groups, labels)
     else:
-        bins = BINS * OF_PLACE.get(variable, 1)
-        edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, bins + 1)))
-        if edges.size < 3:
+        index = _bins(variable, x)
+        if not index.any():
             return Dependence(variable, signal, 0.0, (), ())
-        index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, edges.size - 2)
-        groups = np.arange(edges.size - 1, dtype=np.float64)
+        groups = np.arange(int(index.max()) + 1, dtype=np.float64)
     factor = np.broadcast_to(times, y.shape)
     centres, curve, inside = [], [], 0.0
     for k in range(groups.size):

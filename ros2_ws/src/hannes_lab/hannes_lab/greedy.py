@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .adequacy import distorted
 from .errors import condition_error, held_out_condition_errors, per_signal, signal_errors
@@ -100,8 +100,33 @@ def largest_error(search: Search, candidate: Candidate) -> float:
     return max((e.ratio for e in errors if math.isfinite(e.ratio)), default=math.inf)
 
 
-def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grown:
+def grown_straight(search: Search, null: Candidate, max_effects: int, gain: float) -> Grown:
+    """As `grow`, once more without an effect that ends as another form than is usual of it, beside others.
+
+    What joined later may have bent it: it stands for something else, and what is real beside it need not fall with it.
+    """
+    without: list[str] = []
+    first = grown = grow(search, null, max_effects, gain)
+    while len(grown.best.names) > 1 and (
+        bent := [name for name in grown.best.names if distorted(search, grown.best, [name])]
+    ):
+        without += bent
+        grown = grow(search, null, max_effects, gain, without)
+    if not without or not grown.best.names:
+        return first
+    said = (
+        f"{' and '.join(without)} joined too, and ended as no form that is usual of it: it stood for something else, "
+        "and the search went without"
+    )
+    return replace(grown, notes=(said, *grown.notes))
+
+
+def grow(
+    search: Search, null: Candidate, max_effects: int, gain: float, without: Sequence[str] = ()
+) -> Grown:
     """Add effects until the mean square of the held-out error falls by less than the part `gain`, or none is left.
+
+    An effect that others, which joined later, leave less than that to take goes again.  None joins that is `without`.
 
     An error that the machine's own repeats explain is not looked into: what joined would be fitted to chance.
     The candidates of a round are compared quickly; whether the best of them joins is decided by refits of their own.
@@ -112,6 +137,7 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
     errors = [1.0 if units else search.once(held_out_error, null, text="nominal: held-out conditions")]
     rivals: tuple[Candidate, ...] = ()
     notes: list[str] = []
+    names = [name for name in search.sources if name not in without]
     while len(best.names) < max_effects:
         if not units and errors[-1] <= AS_IT_REPEATS:
             notes.append(
@@ -127,14 +153,14 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
             )
             break
         text = f"effect {len(best.names) + 1}"
-        singles = search.extend([best], list(search.sources), text)
+        singles = search.extend([best], names, text)
         if not singles:
             break
         first = first or tuple(singles)
         found = _judge(search, singles, text, best, gain, errors[-1], units)
         if not found.falls(errors[-1]) and len(best.names) + 2 <= max_effects:
             # Two effects may be worth it of which neither is alone.
-            pairs = search.extend(singles[:JUDGED], list(search.sources), f"{text}, as a pair")
+            pairs = search.extend(singles[:JUDGED], names, f"{text}, as a pair")
             asked = 1.0 - (1.0 - gain) ** 2
             two = _judge(search, pairs, text, best, asked, errors[-1], units) if pairs else found
             if two.falls(errors[-1]):
@@ -151,7 +177,33 @@ def grow(search: Search, null: Candidate, max_effects: int, gain: float) -> Grow
             notes.append(_close_call(best, rivals))
         best, rivals = found.best, found.rivals
         errors.append(found.error)
+    while len(best.names) > 2:
+        less = _superfluous(search, best, gain, errors[-1], units)
+        if less is None:
+            break
+        gone = next(name for name in best.names if name not in less[0].names)
+        notes.append(
+            f"{gone} joined before the others did; without it the held-out error is {less[1]:.2f} instead of "
+            f"{errors[-1]:.2f}{OF_NOMINAL if units else ''}: it went again"
+        )
+        rivals = tuple(search.without(r, [tuple(n for n in r.names if n != gone)])[0] for r in rivals)
+        best = less[0]
+        errors.append(less[1])
     return Grown(best, first, tuple(errors), rivals, tuple(notes))
+
+
+def _superfluous(
+    search: Search, best: Candidate, gain: float, error: float, units: Units
+) -> tuple[Candidate, float] | None:
+    """The set without the effect that takes least of the mean square held-out error, if that is less than `gain`.
+
+    Its error comes with it.  What joined last has just been judged.
+    """
+    parts = search.without(best, [tuple(n for n in best.names if n != name) for name in best.names[:-1]])
+    held = search.each(held_out_error, [(c, True, units) for c in parts], "held-out conditions without one")
+    part = parts[min(range(len(parts)), key=lambda k: held[k])]
+    left = search.once(held_out_error, part, False, units, text="held-out conditions without one")
+    return (part, left) if (1.0 - gain) * left**2 <= error**2 else None
 
 
 @dataclass(frozen=True)

@@ -241,6 +241,14 @@ def _gains(settings: DoublePIDParameters, changed: tuple[tuple[str, float], ...]
     return replace(settings, **dict(changed)).to_array()
 
 
+@lru_cache(maxsize=512)
+def _divided(names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
+    """Of the names of values those of the plant's parameters, and those of the controller's gains with the gain."""
+    apart = (HAND_ZERO, HOMING)
+    of_plant = tuple(n for n in names if not n.startswith(("control.", "log.")) and n not in apart)
+    return of_plant, tuple((n, n.removeprefix("control.")) for n in names if n.startswith("control."))
+
+
 class HandRig(PlantRig):
     """Simulates trials of the hand, on whichever plant the model names: objects, sensors and encoder zero per trial.
 
@@ -456,22 +464,13 @@ class HandRig(PlantRig):
 
     def run(self, model: Model, values: Mapping[str, float], trial: Trial, reference: Array) -> Rollout:
         """The rollout itself; gains of the controller and the clock of the reference may be among the values."""
-        of_plant: dict[str, float] = {}
-        gains: dict[str, float] = {}
-        delay = lead = shift = wound = 0.0
-        for name, value in values.items():
-            if name.startswith("control."):
-                gains[name.removeprefix("control.")] = value
-            elif name == f"{REFERENCE_DELAY}@{trial.name}":
-                delay = value
-            elif name == REFERENCE_LEAD and not is_described(trial):
-                lead = value
-            elif name == HAND_ZERO:
-                shift = value if is_described(trial) else 0.0
-            elif name == HOMING:
-                wound = 0.0 if is_described(trial) else value
-            elif not name.startswith("log."):
-                of_plant[name] = value
+        strange = not is_described(trial)
+        names, gains = _divided(tuple(values))
+        of_plant = {name: values[name] for name in names}
+        delay = values.get(f"{REFERENCE_DELAY}@{trial.name}", 0.0)
+        lead = values.get(REFERENCE_LEAD, 0.0) if strange else 0.0
+        shift = 0.0 if strange else values.get(HAND_ZERO, 0.0)
+        wound = values.get(HOMING, 0.0) if strange else 0.0
         before = None
         if wound and trial.closures[0].start < WINDING:
             before = np.full(round(WINDING / trial.period), reference[0])
@@ -484,7 +483,9 @@ class HandRig(PlantRig):
         if trial.name in self._lowest and LOWEST in plant.names:
             of_plant[LOWEST] = self._lowest[trial.name]
         if isinstance(controller, DoublePID):
-            controller.parameters[:] = _gains(controller.settings, tuple(gains.items()))
+            controller.parameters[:] = _gains(
+                controller.settings, tuple((gain, values[name]) for name, gain in gains)
+            )
         return self._run(model, of_plant, trial, moved(reference, delay, lead, trial), before)
 
     def observed(

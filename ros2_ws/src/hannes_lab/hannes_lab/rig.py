@@ -424,10 +424,8 @@ class PlantRig:
     def _wanted(self, model: Model, values: Mapping[str, float], trial: Trial) -> dict[str, float]:
         """Parameters of the plant by name, for one trial."""
         wanted = dict(self._of(model)[1])
-        for name, value in values.items():
-            parameter, _, where = name.partition("@")
-            if not where or where == trial.name:
-                wanted[parameter] = value
+        for name, parameter in _of_trial(tuple(values), trial.name):
+            wanted[parameter] = values[name]
         return wanted
 
     def _plant(self, model: Model, trial: Trial) -> tuple[Plant, Controller, dict[str, float]]:
@@ -440,6 +438,13 @@ class PlantRig:
             _check_law(law, trial.period, f"The control law '{model.controller}'")
             self._plants[key] = (plant, law, {})
         return self._plants[key]
+
+
+@lru_cache(maxsize=512)
+def _of_trial(names: tuple[str, ...], trial: str) -> tuple[tuple[str, str], ...]:
+    """Which of the values' names concern a trial, and the parameters that they mean (`name@trial`)."""
+    parts = ((name, *name.partition("@")) for name in names)
+    return tuple((name, parameter) for name, parameter, _, where in parts if where in ("", trial))
 
 
 def make_controller(model: Model, period: float) -> Controller:
