@@ -368,6 +368,68 @@ def test_a_recorder_that_hears_nothing_ends_quietly(start: Start, tmp_path: Path
     node.destroy_node()
 
 
+def test_a_disk_that_fails_ends_the_recorder(
+    ros_environment: dict[str, str], tmp_path: Path, ros_context: Any
+) -> None:
+    """What is not on the disk when the power fails would be lost, and nobody would know."""
+    code = (
+        "import errno, os, sys\n"
+        "def broken(number): raise OSError(errno.EIO, os.strerror(errno.EIO))\n"
+        "os.fdatasync = broken\n"
+        "sys.argv = ['recorder', '--ros-args', '-p', 'output:=bag']\n"
+        "from hannes_bags.recorder_node import main\n"
+        "main()\n"
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", code],
+        env=ros_environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    node, output = publisher(ros_context)
+    try:
+        settle(lambda: output.get_subscription_count() > 0)
+        settle(lambda: drive(output, 0.1) > 0.0 and child.poll() is not None)
+    finally:
+        child.kill()
+        said, _ = child.communicate()
+        node.destroy_node()
+    assert child.returncode == 2 and "Cannot write the bag" in said and "Input/output error" in said
+    assert "Traceback" not in said
+
+
+def test_a_hand_in_another_namespace_is_recorded_there(
+    start: Start, ros_environment: dict[str, str], tmp_path: Path, ros_context: Any
+) -> None:
+    from hannes_ros.convert import MOTOR_STATE
+    from rclpy.node import Node
+    from sensor_msgs.msg import JointState
+
+    node = Node("board", context=ros_context, namespace="left")
+    output = node.create_publisher(JointState, "motor/state", 10)
+    state = MOTOR_STATE.encode(time.time_ns(), (0.5,), (0.0,), (0.0,))
+    child = start("recorder", output=str(tmp_path / "nothing"))
+    says(child, "/left/motor/state is published: record with --namespace /left")
+    end(child, signal.SIGINT)
+    child = subprocess.Popen(
+        [sys.executable, "-m", "hannes_bringup.cli", "record", "bag", "--namespace", "left"],
+        env=ros_environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    try:
+        settle(lambda: output.get_subscription_count() > 0)
+
+        def recorded() -> bool:
+            output.publish(state)
+            time.sleep(0.02)
+            return b"/left/motor/state" in written(tmp_path / "bag")
+
+        settle(recorded)
+        end(child, signal.SIGINT)
+    finally:
+        child.kill()
+        child.communicate()
+        node.destroy_node()
+    assert [entry.name for entry in bag_info(tmp_path / "bag").topics] == ["/left/motor/state"]
+
+
 def test_the_player_says_who_is_missing(start: Start, tmp_path: Path) -> None:
     bag = write_recording(recording(n=50, names=("grip_force",)), tmp_path / "bag")
     child = start("player", bag=str(bag), subscribers=1, wait=0.2)

@@ -159,3 +159,23 @@ def test_reference_in_real_time_catches_up_with_a_channel_that_came_late(peer):
     used = [*alone, *paired[:20], *later]
     assert values(peer, "reference_position") == [integrator.update(sample, 0.0) for sample in used]
     assert status["dropped_samples"] == "80"
+
+
+def test_an_emg_of_another_rate_is_told(peer):
+    """Its samples are counted, each for 1 / rate: the hand would move too slowly, and nobody would know."""
+    peer.hear_diagnostics()
+
+    def message_after_a_sample(words: str) -> bool:
+        for name in EMG:
+            peer.say(name, convert.float64_bytes(0.5))
+        peer.spin(0.02)
+        return words in peer.status("emg_reference").get("message", "")
+
+    with processes(NodeProcess("emg_reference", rate=2000)):
+        for name in EMG:
+            peer.matched(name)
+        words = "counts for 1/2000 s: the reference moves at 0."
+        peer.until(lambda: message_after_a_sample(words), what=words)
+        status = peer.status("emg_reference")
+    assert status["level"] == "1" and status["message"].startswith("EMG comes at ")
+    assert all(0.0 < float(rate) < 100.0 for rate in status["emg_rates_hz"].split(", "))

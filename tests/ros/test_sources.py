@@ -7,6 +7,7 @@ from graph import PATIENT, NodeProcess, Peer, processes
 from hannes_control.double_pid import DoublePID
 from hannes_description.model import Model
 from hannes_ros import convert, topics
+from std_msgs.msg import Float32
 
 ERROR = "2"
 
@@ -163,3 +164,12 @@ def test_in_real_time_each_input_with_two_sources_is_reported_and_logged(peer, n
         every = ", ".join(f"2 publishers of {topics.signal(name).topic}" for name in names)
         peer.until_status(node, lambda s: s["message"].startswith(f"{every}; end all but one"))
         peer.until(lambda: "; end all but one" in process.output, what="the same in the log")
+
+
+def test_a_source_of_another_type_is_told(peer):
+    """Nothing of it is heard, and neither side would say why."""
+    peer.hear_diagnostics()
+    peer.node.create_publisher(Float32, "emg/flexor", 10)
+    with processes(NodeProcess("emg_reference")):
+        told = "emg/flexor is published by peer as std_msgs/msg/Float32, which is not heard: it must be std_msgs/msg/Float64"
+        peer.until_status("emg_reference", lambda s: told in s["message"] and s["level"] == ERROR, told)

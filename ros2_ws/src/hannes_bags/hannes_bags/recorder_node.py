@@ -19,7 +19,7 @@ from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
 from hannes_ros.sources import Sources
 from hannes_ros.taking import taken
-from hannes_ros.topics import CLOCK_TOPIC, DIAGNOSTICS_TOPIC
+from hannes_ros.topics import CLOCK_TOPIC, CLOCK_TYPE, DIAGNOSTICS_TOPIC
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -33,6 +33,7 @@ _LOOK_S = 0.05
 _SYNC_S = 1.0
 _STOP_S = 0.5
 _LATE_S = 2.0
+_ELSEWHERE_S = 10.0
 _OWN_CLOCK_NS = 1_000_000_000
 _HELD_MS = 170.0
 """From when a message is taken until it is handed over at the latest: less than the 0.2 s that a kill may take."""
@@ -41,7 +42,7 @@ _MOST_AT_ONCE = 5000
 _LEADING = SIGNALS["encoder_position"].topic
 _TYPES = {
     **{signal.topic: signal.type for signal in SIGNALS.values()},
-    CLOCK_TOPIC: "rosgraph_msgs/msg/Clock",
+    CLOCK_TOPIC: CLOCK_TYPE,
     DIAGNOSTICS_TOPIC: "diagnostic_msgs/msg/DiagnosticArray",
 }
 
@@ -151,8 +152,10 @@ class RecorderNode(HannesNode, Node):
         self._leading_at = 0.0
         self._matched = 0
         self._late_at = 0.0
+        self._elsewhere_at = time.monotonic() + _LATE_S
         self._recorder: Recorder | None = None
         self._begun: set[str] = set()
+        self._unwritten: HannesError | None = None
         self._stop_sync = threading.Event()
         self._sync = threading.Thread(target=self._keep_on_disk, name="sync", daemon=True)
         self._look()
@@ -166,7 +169,8 @@ class RecorderNode(HannesNode, Node):
         """Subscribe to what there is; the leading topic last, since in lock-step it starts the run."""
         if not self._decided:
             self._decide()
-        if self._simulated:
+        self._look_for_the_hand()
+        if self._simulated and self._decided:
             self._clocks.several()
             if self._recorder is not None and self._times.latest is None and time.monotonic() > self._late_at:
                 self.get_logger().warning(
@@ -181,6 +185,23 @@ class RecorderNode(HannesNode, Node):
             elif self._unheard(topic):
                 self._ears.destroy_subscription(self._subscriptions_by_topic.pop(topic))
                 self._subscribe(topic, msgtype)
+
+    def _look_for_the_hand(self) -> None:
+        """Say where a hand is whose topics are elsewhere than those that are recorded, while nothing of it comes."""
+        if self._begun - {self._clock, self._health} or time.monotonic() < self._elsewhere_at:
+            return
+        self._elsewhere_at = time.monotonic() + _ELSEWHERE_S
+        seen = [
+            name
+            for name, _ in self.get_topic_names_and_types()
+            if name.endswith(f"/{_LEADING}") and name not in self._wanted and self.count_publishers(name)
+        ]
+        if seen:
+            space = seen[0].removesuffix(f"/{_LEADING}") or "/"
+            self.get_logger().warning(
+                f"nothing of the hand comes under {self.get_namespace()}, but {' and '.join(seen)} is published: "
+                f"record with --namespace {space} (of the node: -r __ns:={space})"
+            )
 
     def _decide(self) -> None:
         """Whether there is simulated time: a publisher of /clock says yes, signals for 0.1 s without one say no."""
@@ -330,15 +351,20 @@ class RecorderNode(HannesNode, Node):
         if self._unchecked():
             return
         try:
+            if self._unwritten is not None:
+                raise self._unwritten
             self._recorder.hand_over(now_ns)
         except HannesError as error:
             self.fail(error)
 
     def _keep_on_disk(self) -> None:
         """A power failure takes at most a second; in a thread, since a disk may be slow."""
-        while not self._stop_sync.wait(_SYNC_S):
-            if self._recorder is not None:
-                self._recorder.writer.sync()
+        while self._unwritten is None and not self._stop_sync.wait(_SYNC_S):
+            try:
+                if self._recorder is not None:
+                    self._recorder.writer.sync()
+            except HannesError as error:
+                self._unwritten = error  # the thread of the messages ends the node
 
     def stop(self) -> None:
         """Take what is still on its way, close the bag, tell what is in it.

@@ -195,12 +195,18 @@ class BagWriter:
             self._mcap.end_chunk()
             self._stream.flush()
         except OSError as error:
-            raise HannesError(f"Cannot write the bag {self.path}: {error.strerror or error}.") from None
+            raise self._cannot_write(error) from None
+
+    def _cannot_write(self, error: OSError) -> HannesError:
+        return HannesError(f"Cannot write the bag {self.path}: {error.strerror or error}.")
 
     def sync(self) -> None:
         """Wait until the disk has what was handed over; may be called from another thread than the others."""
-        if not self._stream.closed:
-            os.fdatasync(self._stream.fileno())
+        try:
+            if not self._stream.closed:
+                os.fdatasync(self._stream.fileno())
+        except OSError as error:
+            raise self._cannot_write(error) from None
 
     def close(self, more_metadata: Mapping[str, Any] | None = None) -> None:
         """Write the index and metadata.yaml; harmless if called again.
@@ -229,7 +235,7 @@ class BagWriter:
             self._stream.close()
             write_whole(self.path / METADATA_FILE, text)
         except OSError as error:
-            raise HannesError(f"Cannot write the bag {self.path}: {error.strerror or error}.") from None
+            raise self._cannot_write(error) from None
 
     def _information(self) -> dict[str, Any]:
         counts = self.counts()

@@ -176,9 +176,11 @@ def _watch(node: Node, executor: Executor, window: float) -> GraphSeen:
     _discover(node, executor, subscribed)
     for heard in subscribed.values():
         heard.count = 0
-    started = time.monotonic()
-    _spin(executor, window)
-    now = time.monotonic()
+    started = now = time.monotonic()
+    while now - started < window:
+        _subscribe(node, subscribed)  # what is discovered late is listened to from then on
+        _spin(executor, min(0.2, window - (now - started)))
+        now = time.monotonic()
     types = _topics(node)
     topics = []
     for name, kind in sorted(types.items()):
@@ -207,19 +209,24 @@ def _watch(node: Node, executor: Executor, window: float) -> GraphSeen:
 
 
 def _discover(node: Node, executor: Executor, subscribed: dict[str, _Arrivals]) -> None:
-    """Subscribe to every topic with a publisher, until no more of them appear."""
+    """Subscribe to every topic with a publisher, until no more of them appear; as long as it takes if none does."""
     started = changed = time.monotonic()
     known: tuple[set[str], int] = (set(), 0)
     while (now := time.monotonic()) - changed < QUIET and now - started < LONGEST:
-        for name, kind in _topics(node).items():
-            message = message_class(kind)
-            if name not in subscribed and message is not None and node.count_publishers(name):
-                subscribed[name] = _Arrivals(keep_last=name == "/diagnostics")
-                node.create_subscription(message, name, subscribed[name], _listener_qos(), raw=True)
+        _subscribe(node, subscribed)
         seen = (set(subscribed), len(node.get_node_names()))
-        if seen != known:
+        if seen != known or not subscribed:
             known, changed = seen, now
         _spin(executor, 0.05)
+
+
+def _subscribe(node: Node, subscribed: dict[str, _Arrivals]) -> None:
+    """Listen to the topics with a publisher that are not listened to yet."""
+    for name, kind in _topics(node).items():
+        message = message_class(kind)
+        if name not in subscribed and message is not None and node.count_publishers(name):
+            subscribed[name] = _Arrivals(keep_last=name == "/diagnostics")
+            node.create_subscription(message, name, subscribed[name], _listener_qos(), raw=True)
 
 
 def _topics(node: Node) -> dict[str, str]:

@@ -12,7 +12,7 @@ from time import monotonic
 import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 from hannes_description.errors import HannesError
 from hannes_ros import convert, topics
-from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health, silence
+from hannes_ros.diagnostics import ERROR, OK, WARN, Arrivals, Diagnostics, Health, silence
 from hannes_ros.lockstep import Peers, Probe, samples_until
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
@@ -26,6 +26,9 @@ _CHECK_S = 0.02
 _DEFAULT = EmgParameters()
 _CHANNELS = ("emg_flexor", "emg_extensor")
 _TOPICS = tuple(topics.signal(name).topic for name in _CHANNELS)
+_RATE_OFF = 0.1
+"""Part of its rate by which a channel may differ from it: samples are counted, each for 1 / rate."""
+
 _LONGEST_QUEUE = 1000
 """Samples of a channel that wait for the other channel or their tick, at most; its topic holds fewer."""
 
@@ -99,6 +102,7 @@ class EmgReferenceNode(HannesNode, Node):
         )
         self._held = [0.0, 0.0]
         self._heard: dict[str, float] = {}
+        self._arrivals = tuple(Arrivals() for _ in _CHANNELS)
         self._waiting = [_LONGEST_QUEUE, _LONGEST_QUEUE]
         self._taken = 0
         self._stamp = -1
@@ -131,7 +135,9 @@ class EmgReferenceNode(HannesNode, Node):
         else:
             self._health.count("rejected_samples")
         self._channels[number].append(self._held[number])
-        self._heard[_TOPICS[number]] = self._health.last_input = monotonic()
+        self._heard[_TOPICS[number]] = self._health.last_input = now = monotonic()
+        clock = self.get_clock()
+        self._arrivals[number].came(clock.now().nanoseconds * 1e-9 if clock.ros_time_is_active else now)
         if self._lockstep:
             self._answer()
         elif all(self._channels):
@@ -219,21 +225,40 @@ class EmgReferenceNode(HannesNode, Node):
         if not self._peers.complete and not self._peers.missing():
             self._answer()
 
+    def _rates(self, both: bool) -> str:
+        """Rates of both channels; in real time, where `both` come, one that is not the parameter's is a fault."""
+        rates = [arrivals.rate() for arrivals in self._arrivals]
+        known, wanted = [rate for rate in rates if rate is not None], self._p.rate
+        if self._lockstep or not both or all(abs(r - wanted) <= _RATE_OFF * wanted for r in known):
+            self._health.faults.good("rate")
+        else:
+            # A pair is taken when both are there: the slower channel tells how often.
+            self._health.faults.bad(
+                "rate",
+                WARN,
+                f"EMG comes at {' and '.join(f'{r:.0f}' for r in known)} Hz, and a sample counts for 1/{wanted} s: the "
+                f"reference moves at {min(known) / wanted:.2g} times the speed. Start emg_reference with the rate of "
+                "your EMG (-p rate:=..., 100 Hz or more)",
+            )
+        return ", ".join("" if rate is None else f"{rate:.1f}" for rate in rates)
+
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         values: dict[str, object] = {
             "reference_rad": f"{self._emg.reference:.6g}",
             "switch_events": self._switches,
             "samples": self._taken,
         }
+        absent = [topic for topic in _TOPICS if topic not in self._heard]
+        silent = "" if absent else silence({t: self._heard[t] for t in _TOPICS})
+        values["emg_rates_hz"] = self._rates(not (absent or silent))
         if several := self._sources.several():
             return ERROR, several, values
         if self._lockstep and (missing := self._peers.missing()):
             return WARN, f"waiting for {', '.join(missing)}", values
-        absent = [topic for topic in _TOPICS if topic not in self._heard]
         if absent:
             return WARN, f"waiting for {' and '.join(absent)}", values
         # In lock-step there is nothing to hear while no tick waits for it.
-        if (self._ticks or not self._lockstep) and (silent := silence({t: self._heard[t] for t in _TOPICS})):
+        if silent and (self._ticks or not self._lockstep):
             return WARN, f"{silent}: the reference stands", values
         if self._ticks:
             return OK, "waiting for EMG samples", values

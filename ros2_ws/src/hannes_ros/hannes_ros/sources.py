@@ -1,10 +1,11 @@
-"""Each topic has one source: who tells of a second one, whose messages mix with those of the first."""
+"""Each topic has one source: who tells of a second one, whose messages mix with those of the first, and of one whose
+messages are of another type, which nobody hears."""
 
 from __future__ import annotations
 
 from rclpy.node import Node
 
-from .topics import CLOCK_TOPIC, signal
+from .topics import CLOCK_TOPIC, CLOCK_TYPE, signal
 
 _LOG_S = 30.0
 
@@ -29,14 +30,23 @@ class Sources:
         return any(self.count(name) > 1 for name in self._names)
 
     def several(self) -> str | None:
-        """What to report of inputs with more than one publisher, logged too; None where each has one at most."""
+        """What to report of inputs with several publishers, or one of another type, logged too; None if all is well."""
         counts = {name: self.count(name) for name in self._names}
         mixed = [f"{n} publishers of {_topic(name)}" for name, n in counts.items() if n > 1]
-        if not mixed:
+        wrong = [text for name, n in counts.items() if n for text in self._of_another_type(name)]
+        if not (mixed or wrong):
             return None
-        text = f"{', '.join(mixed)}; {self._rule}"
+        text = "; ".join([*wrong, *([f"{', '.join(mixed)}; {self._rule}"] if mixed else [])])
         self._node.get_logger().error(text, throttle_duration_sec=_LOG_S)
         return text
+
+    def _of_another_type(self, name: str) -> list[str]:
+        topic, wanted = _topic(name), CLOCK_TYPE if name == CLOCK_TOPIC else signal(name).type
+        return [
+            f"{topic} is published by {info.node_name} as {info.topic_type}, which is not heard: it must be {wanted}"
+            for info in self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
+            if info.topic_type != wanted
+        ]
 
     def surplus(self, name: str) -> str:
         """The error of a lock-step whose messages no longer belong together, because of that signal's topic."""

@@ -24,6 +24,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
 
 CLOCK_TOPIC: Final = "/clock"
+CLOCK_TYPE: Final = "rosgraph_msgs/msg/Clock"
 DIAGNOSTICS_TOPIC: Final = "/diagnostics"
 
 MESSAGE_TYPES: Final[Mapping[str, type]] = MappingProxyType(

@@ -25,6 +25,9 @@ def record(
     condition: Annotated[str, typer.Option(help="What was done, for instance slow, fast or grasp.")] = "",
     object: Annotated[str, typer.Option(help="What the hand closed on.")] = "",
     topic: TopicOption = None,
+    namespace: Annotated[
+        str, typer.Option(help="Where the hand's topics are, if not /hannes: /left for /left/motor/state.")
+    ] = "",
     profile: Annotated[
         str,
         typer.Option(help="Drive the hand too: half_sine, ramp_hold or reversals, by a motor_controller."),
@@ -59,13 +62,15 @@ def record(
         parameters["metadata"] = json.dumps(said)
     if topic:
         parameters["topics"] = topic
+    if profile and namespace:
+        raise HannesError("--profile moves the hand of /hannes: start a controller in --namespace yourself.")
     if profile:
         _record_profile(parameters, profile, closures or 13, period, amplitude, model, more or [])
     else:
         given = {"--closures": closures, "--period": period, "--amplitude": amplitude, "--model": model}
         if idle := ", ".join(name for name, value in given.items() if value):
             raise HannesError(f"{idle}: only --profile, which drives the hand, makes use of that.")
-        _become("recorder", parameters, more or [])
+        _become("recorder", parameters, more or [], namespace)
 
 
 SEEK = 5.0
@@ -193,12 +198,13 @@ def _words(parameters: dict[str, Any], more: list[str]) -> list[str]:
     return words
 
 
-def _become(executable: str, parameters: dict[str, Any], more: list[str]) -> None:
-    """Turn this process into the node."""
+def _become(executable: str, parameters: dict[str, Any], more: list[str], namespace: str = "") -> None:
+    """Turn this process into the node, in a namespace of its own if one is given."""
     from hannes_bringup.environment import require_ros, ros_environment
     from hannes_bringup.ros2_standin import find_command
 
     require_ros()
     environment = ros_environment()
     command = find_command("hannes_bags", executable, environment)
-    os.execve(command[0], [*command, *_words(parameters, more)], environment)
+    words = _words(parameters, more) + (["-r", f"__ns:=/{namespace.strip('/')}"] if namespace else [])
+    os.execve(command[0], [*command, *words], environment)
