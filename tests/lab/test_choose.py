@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from hannes_lab import choose as module
+from hannes_lab import wording
 from hannes_lab.chance import Chance
 from hannes_lab.choose import OWN_ERROR_PART, Choice, _thoroughly, choose, choose_greedily
 from hannes_lab.diagnose import _behind_the_law
 from hannes_lab.search import PENALTY, Candidate
-from hannes_lab.wording import nearest_sentence
+from hannes_lab.wording import lead, nearest_sentence
 
 LIMITS = Chance(misfit=1100.0, gain=20.0, median=900.0, draws=0, resampled=False)
 
@@ -192,3 +193,25 @@ def test_effects_that_only_replace_what_the_model_had_are_no_answer(
     assert choice.enough == choice.adequate == (not why)
     assert (why in choice.left and "no more than the machine repeats" in choice.left) == bool(why)
     assert choice.other_model == bool(why)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "gain", "said"),
+    [(5.2, 15.0, True), (2.0, 15.0, False), (5.2, 5.0, False)],
+    ids=["", "near", "chance"],
+)
+def test_what_would_come_next_is_told_where_much_is_left(
+    given: pytest.MonkeyPatch, ratio: float, gain: float, said: bool
+) -> None:
+    """No finding: what the form of another machine may be off by hides it."""
+    given.setattr(wording, "disbelieved", lambda search, c: "")
+    one = made(("a",), 700.0, 1.0)
+    search = search_of(NULL, one, made(("a", "b"), 700.0 - gain, 1.0), made(("a", "c"), 699.0, 1.0))
+    choice = Choice(search, one, LIMITS, True, ())
+    error = SimpleNamespace(signal="motor_voltage", condition="fast", ratio=ratio)
+    fall: Any = SimpleNamespace(signals=(error,))
+    notes = lead(choice, (fall,))
+    assert bool(notes) == said
+    if said:
+        assert "motor_voltage of 'fast' is still missed by 5.2 times" in notes[0]
+        assert "is b, by 15 (chance: 20, and " in notes[0] and "--effect a --effect b" in notes[0]

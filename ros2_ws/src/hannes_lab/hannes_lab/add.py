@@ -19,6 +19,7 @@ from .executor import Executor
 from .falls import error_falls, fall_sentence
 from .features import data_used
 from .prepare import Prepared
+from .screen import silent_effects
 from .search import Progress, Search, silent
 
 
@@ -72,6 +73,11 @@ def add_effects(
             "(see `hannes model effects`) or path.py:Class."
         )
     check_effects(prepared, sources)
+    silent = [
+        f"{name} moves none of the compared signals at its typical values, so that what is fitted of it says nothing: "
+        "does it act where this machine moves, and are its figures in this machine's units?"
+        for name in silent_effects(prepared, sources)
+    ]
     search = Search(
         prepared.problem,
         prepared.model,
@@ -102,7 +108,7 @@ def add_effects(
         found_effects(search, best, intervals, falls),
         falls,
         data_used(prepared.features),
-        prepared.notes,
+        (*silent, *prepared.notes),
         best.fit.values,
         null.fit.values,
         None if prepared is given else prepared,

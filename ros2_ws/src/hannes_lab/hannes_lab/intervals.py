@@ -91,8 +91,10 @@ def sway(problem: Problem, found: Fit) -> dict[str, float]:
         part = (moved**2).sum(axis=1)
         variance += part
         by_freedom += part**2 / (counts[trial] - 1.0)
-    freedom = variance**2 / np.maximum(by_freedom, 1e-12 * variance**2)
-    ratios = np.sqrt(variance / np.diag(inverse)) * stdtrit(freedom, 0.975) / NORMAL
+    freedom = variance**2 / np.maximum(by_freedom, np.maximum(1e-12 * variance**2, 1e-300))
+    # What moves nothing has no width of either kind.
+    none = np.diag(inverse) <= 0.0
+    ratios = np.sqrt(variance / np.where(none, 1.0, np.diag(inverse))) * stdtrit(freedom, 0.975) / NORMAL
     return {c.name: max(1.0, float(r)) for c, r in zip(found.coordinates, ratios, strict=True)}
 
 

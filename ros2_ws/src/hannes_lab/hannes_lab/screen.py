@@ -34,17 +34,22 @@ def usable_effects(prepared: Prepared, sources: Mapping[str, str]) -> Usable:
     without = prepared.rig.without
     notes = [f"{name} is not considered: {without[name]}" for name in sources if name in without]
     offered = {name: source for name, source in sources.items() if name not in without}
-    alone = _moving(prepared, offered)
-    moving = set(alone)
-    for other in (name for name in offered if name in alone):
-        moving |= _moving(prepared, {n: s for n, s in offered.items() if n not in moving}, offered[other])
-    silent = [name for name in offered if name not in moving]
+    silent = silent_effects(prepared, offered)
     if silent:
         notes.append(
             f"{', '.join(silent)} would move none of the compared signals on this machine and "
             f"{'is' if len(silent) == 1 else 'are'} not considered"
         )
-    return Usable({name: source for name, source in offered.items() if name in moving}, tuple(notes))
+    return Usable({name: source for name, source in offered.items() if name not in silent}, tuple(notes))
+
+
+def silent_effects(prepared: Prepared, sources: Mapping[str, str]) -> list[str]:
+    """Names of the effects that move no compared signal when switched on, neither alone nor beside another of them."""
+    alone = _moving(prepared, sources)
+    moving = set(alone)
+    for other in (name for name in sources if name in alone):
+        moving |= _moving(prepared, {n: s for n, s in sources.items() if n not in moving}, sources[other])
+    return [name for name in sources if name not in moving]
 
 
 def _moving(prepared: Prepared, sources: Mapping[str, str], other: str | None = None) -> set[str]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .adequacy import shortfall
+from .adequacy import disbelieved, shortfall
 from .chance import Chance
 from .choose import Choice, can_be_held_out, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
@@ -287,6 +287,45 @@ def nearest_sentence(choice: Choice) -> str:
     return (
         f" The effect that comes nearest is {' + '.join(first.names)}: it lowers the misfit by {max(gain, 0.0):.0f}, "
         f"and {asked:.0f} are asked for."
+    )
+
+
+LEAD = 3.0
+"""Multiples of the repeatability by which a signal of a condition is still missed, from which the effect is told that
+would lower the misfit most."""
+
+LEAST_LEAD = 0.5
+"""Part of what chance gains that it must lower it by."""
+
+
+def lead(choice: Choice, falls: Sequence[Fall]) -> tuple[str, ...]:
+    """What is still missed where effects were found on a machine of others, and the effect that would come next.
+
+    The error that a model of another machine is allowed hides what is smaller than it.
+    """
+    search, best = choice.search, choice.best
+    errors = [e for e in falls[-1].signals if np.isfinite(e.ratio)]
+    worst = max(errors, key=lambda e: e.ratio, default=None)
+    if not (search.problem.discrepancy and best.names and worst is not None and worst.ratio >= LEAD):
+        return ()
+    further = [
+        c
+        for c in search.found.values()
+        if set(c.names) > set(best.names)
+        and len(c.names) == len(best.names) + 1
+        and not disbelieved(search, c)
+    ]
+    following = min(further, key=lambda c: c.penalised, default=None)
+    gain = best.penalised + PENALTY - following.penalised if following is not None else 0.0
+    if following is None or gain < LEAST_LEAD * choice.limits.gain:
+        return ()
+    (name,) = set(following.names) - set(best.names)
+    asked = needed_gain(choice, best, following)
+    return (
+        f"{worst.signal} of '{worst.condition}' is still missed by {worst.ratio:.1f} times the repeatability, which "
+        f"the model of another machine may be off by. What would lower the misfit most is {name}, by {gain:.0f} "
+        f"(chance: {choice.limits.gain:.0f}, and {asked:.0f} are asked for): no finding, but worth a look with "
+        f"`hannes add ... {' '.join(f'--effect {n}' for n in (*best.names, name))}`",
     )
 
 
