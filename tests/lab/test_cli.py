@@ -39,6 +39,21 @@ def test_compare(bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: py
     assert code == 0 and content["overall"] > 2.0 and content["metrics"] and content["cells"]
 
 
+def test_trials(bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is read, before anything is simulated."""
+    code, out, _ = hannes("trials", str(bags), "--json", capsys=capsys, monkeypatch=monkeypatch)
+    slow = next(t for t in json.loads(out)["trials"] if t["name"] == "slow")
+    assert code == 0 and [(c["name"], c["closures"]) for c in slow["conditions"]] == [("slow", 6)]
+    signals = {s["name"]: s for s in slow["signals"]}
+    assert signals["reference"]["unit"] == "rad" and signals["reference"]["rate"] == pytest.approx(1000.0)
+    assert signals["motor_current"]["rate"] == pytest.approx(30.0, rel=0.02)
+    assert signals["encoder_position"]["highest"] == pytest.approx(12.0, abs=1.5)
+    code, out, _ = hannes("trials", str(bags), capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 0 and "motor_current" in out and "control period" in out
+    code, out, err = hannes("trials", "nowhere", capsys=capsys, monkeypatch=monkeypatch)
+    assert code == 2 and "No bag 'nowhere'" in err
+
+
 @pytest.mark.slow
 def test_diagnose_add_and_report(
     bags: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

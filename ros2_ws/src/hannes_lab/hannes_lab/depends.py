@@ -181,7 +181,7 @@ def pointed_at(found: Sequence[Dependence]) -> str:
             continue
         if first.variable == "position":
             return (
-                f"{what} goes with the position, whichever way and however fast, most near {where}: a detent, a "
+                f"{what} goes with the position, whichever way, most near {where}: a detent, a "
                 "magnet, a spring or a cam acts there, or a ripple of another form; examples/effects/local_torque.py "
                 "is an effect for it"
             )

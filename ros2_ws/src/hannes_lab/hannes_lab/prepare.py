@@ -124,6 +124,11 @@ def read_trials(rig: type[PlantRig], paths: Sequence[Path]) -> list[Trial]:
     return check_trials(found, rig.__name__)
 
 
+def joined(trials: Sequence[Trial], rig: type[PlantRig]) -> list[Trial]:
+    """A rig's trials, checked; those that repeat one condition as one, with closures that begin at the same moment."""
+    return [trial.aligned() for trial in join_trials(check_trials(trials, rig.__name__))]
+
+
 def without_outliers(trial: Trial) -> Trial:
     """Leave out closures that are far from the others of their condition (at least five closures needed)."""
     kept: list[Closure] = []
@@ -177,8 +182,7 @@ def prepare(
     typical  closures far from the others are left out already
     """
     if rig is not None:
-        checked = check_trials(trials, rig.__name__)
-        trials = [trial.aligned() for trial in join_trials(checked)]
+        trials = joined(trials, rig)
     if not typical:
         trials = [without_outliers(trial) for trial in trials]
     made: PlantRig = (rig or HandRig)(trials)

@@ -19,8 +19,8 @@ from .diagnosis import Diagnosis
 from .executor import Executor
 from .own_effect import along_reference, check_own_effects, first_closure
 from .prepare import Prepared, load_trials, prepare, read_trials
-from .rig import load_rig
-from .trials import UNITS, stem_of
+from .rig import PlantRig, load_rig
+from .trials import UNITS, Trial, stem_of
 
 
 def prepared_from(
@@ -38,8 +38,20 @@ def prepared_from(
     model    None: that of the adapter, or `nominal`
     threads  see prepare
     """
-    machine = load_rig(rig) if rig else None
+    machine, trials = trials_from(bags, objects, rig, scale, topics)
     model = model or (str(machine.model) if machine else "nominal")
+    return prepare(trials, Model.load(model), rig=machine, signals=signals, surrogate=True, threads=threads)
+
+
+def trials_from(
+    bags: Sequence[Path],
+    objects: Sequence[str] | None = None,
+    rig: str | None = None,
+    scale: Sequence[str] | None = None,
+    topics: Sequence[str] | None = None,
+) -> tuple[type[PlantRig] | None, list[Trial]]:
+    """What is read of recordings, and the class of the adapter that reads them, if one is named."""
+    machine = load_rig(rig) if rig else None
     given = {}
     for text in objects or ():
         name, _, what = text.partition("=")
@@ -66,7 +78,7 @@ def prepared_from(
     trials = [
         replace(t, options={**t.options, "object": given[t.name]}) if t.name in given else t for t in trials
     ]
-    return prepare(trials, Model.load(model), rig=machine, signals=signals, surrogate=True, threads=threads)
+    return machine, trials
 
 
 def _factors(scale: Sequence[str] | None) -> dict[str, float]:

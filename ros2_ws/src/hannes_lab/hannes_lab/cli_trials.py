@@ -1,0 +1,112 @@
+"""`hannes trials`: what the lab reads of recordings, before anything is simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from hannes_description.output import TEXT_WIDTH, number, print_json, show_table, text_console, with_unit
+from hannes_description.signals import SIGNALS
+from rich.table import Table
+
+from .cli_options import Bags, Json, Objects, RigFile, Scale, Topics
+from .prepare import joined, notes_of, without_outliers
+from .session import trials_from
+from .trials import Trial
+
+
+def trials(
+    bags: Bags,
+    objects: Objects = None,
+    scale: Scale = None,
+    topics: Topics = None,
+    rig: RigFile = None,
+    json: Json = False,
+) -> None:
+    """Tell what the lab reads of recordings: conditions, closures, signals with rates, units and ranges.
+
+    Nothing is simulated: a look at what an adapter, or a bag, gives before the first `compare`.
+    """
+    machine, found = trials_from(bags, objects, rig, scale, topics)
+    if machine is not None:
+        found = joined(found, machine)
+    found = [without_outliers(trial) for trial in found]
+    read = [told(trial, "" if machine else SIGNALS["reference_position"].unit) for trial in found]
+    notes = notes_of(found)
+    if json:
+        print_json({"trials": read, "notes": notes})
+    else:
+        _show(read, notes)
+
+
+def told(trial: Trial, unit: str = "") -> dict[str, Any]:
+    """A trial in numbers: times in s, a rate in Hz (the median of its samples), ranges in the signal's unit.
+
+    unit  of the reference
+    """
+    conditions = []
+    for name in trial.conditions:
+        own = trial.of(name)
+        lengths = [c.stop - c.start for c in own]
+        conditions.append(
+            {
+                "name": name,
+                "closures": len(own),
+                "shortest": min(lengths),
+                "longest": max(lengths),
+                "starts": [c.start for c in own],
+            }
+        )
+    signals = [
+        {"name": "reference", "unit": unit, "samples": int(trial.reference.size), "rate": 1.0 / trial.period}
+        | _range(trial.reference)
+    ]
+    for name, (time, values) in trial.signals.items():
+        step = float(np.median(np.diff(time))) if time.size > 1 else float("nan")
+        rate = 1.0 / step if step > 0.0 else None
+        signals.append(
+            {"name": name, "unit": trial.unit(name), "samples": int(time.size), "rate": rate} | _range(values)
+        )
+    return {
+        "name": trial.name,
+        "recordings": [part.source or part.name for part in trial.parts] or [trial.source],
+        "period": trial.period,
+        "seconds": trial.reference.size * trial.period,
+        "conditions": conditions,
+        "signals": signals,
+    }
+
+
+def _range(values: Any) -> dict[str, float]:
+    return {"lowest": float(np.min(values)), "highest": float(np.max(values))}
+
+
+def _show(read: Sequence[dict[str, Any]], notes: Sequence[str]) -> None:
+    console = text_console()
+    table = Table(title="Conditions")
+    for name in ("trial", "recordings", "condition", "closures", "length, s", "control period"):
+        table.add_column(name, justify="left" if name in ("trial", "condition") else "right")
+    for one in read:
+        for c in one["conditions"]:
+            ends = dict.fromkeys((number(c["shortest"], 4), number(c["longest"], 4)))
+            table.add_row(
+                one["name"],
+                str(len(one["recordings"])),
+                c["name"],
+                str(c["closures"]),
+                " .. ".join(ends),
+                with_unit(1e3 * one["period"], "ms"),
+            )
+    show_table(table, TEXT_WIDTH)
+    table = Table(title="Signals")
+    for name in ("trial", "signal", "samples", "rate, Hz", "lowest", "highest", "unit"):
+        table.add_column(name, justify="left" if name in ("trial", "signal", "unit") else "right")
+    for one in read:
+        for s in one["signals"]:
+            rate = "" if s["rate"] is None else number(s["rate"], 4)
+            low, high = number(s["lowest"], 4), number(s["highest"], 4)
+            table.add_row(one["name"], s["name"], str(s["samples"]), rate, low, high, s["unit"])
+    show_table(table, TEXT_WIDTH)
+    for note in notes:
+        console.print(f"note: {note}", style="dim")
