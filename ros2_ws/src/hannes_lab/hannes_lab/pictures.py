@@ -149,7 +149,7 @@ def _panels(fall: Part | None, maps: Sequence[Part], ranks: Part | None) -> list
     if fall and not fall["in_units"]:
         out.append(
             Panel(
-                "Held-out error, × repeatability",
+                f"Error on held-out {'conditions' if fall['by_conditions'] else 'closures'}, × repeatability",
                 _inches([r["label"] for r in fall["rows"]]),
                 2.2,
                 0.3,
@@ -299,7 +299,17 @@ def _overlays(
                     fontsize=8,
                 )
             if i == 0 and j == 0:
-                upper.legend(fontsize=7, frameon=False, loc="best", handlelength=1.5, labelspacing=0.25)
+                # In the corner of the picture, where no curve is.
+                figure.legend(
+                    *upper.get_legend_handles_labels(),
+                    loc="upper right",
+                    bbox_to_anchor=(0.985, 1.0 - 0.12 / figure.get_figheight()),
+                    fontsize=8.5,
+                    frameon=False,
+                    ncols=3,
+                    handlelength=1.8,
+                    columnspacing=1.6,
+                )
 
 
 def _overlay(upper: Axes, lower: Axes, overlay: Part, after: Part | None) -> None:
@@ -341,7 +351,8 @@ def _nan(values: Curve) -> list[float]:
 
 def _fall(axes: Axes, fall: Mapping[str, Any]) -> None:
     rows = fall["rows"]
-    values = [r["held_out"] if r["held_out_at"] is not None else math.nan for r in rows]
+    key = "held_out_conditions" if fall["by_conditions"] else "held_out"
+    values = [r[key] if r[f"{key}_at"] is not None else math.nan for r in rows]
     places = list(range(len(rows)))
     colours = [BEFORE if r["kind"] == "before" else AFTER for r in rows]
     if fall["log"]:

@@ -299,7 +299,7 @@ def _figures(comparison: Part | None, after: Part | None, diagnosis: Part | None
                 }
             )
     elif len(falls) > 1:
-        whole = bool((diagnosis or {}).get("greedy"))
+        whole = by_conditions(diagnosis)
         key, what = ("held_out_conditions", "conditions") if whole else ("held_out", "closures")
         errors = [text.known(fall.get(key)) for fall in falls]
         nearer = before([math.nan if e is None else e for e in errors])
@@ -394,6 +394,11 @@ def fall_in_units(falls: Sequence[Part]) -> dict[str, Any] | None:
     return {"held": held, "signals": [(s, text.unit(units[s])) for s in signals], "rows": rows}
 
 
+def by_conditions(diagnosis: Part | None) -> bool:
+    """Whether the error on conditions that were left out decided, and not that on closures."""
+    return bool((diagnosis or {}).get("greedy"))
+
+
 def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:
     """Bars of the error, step by step, on one scale: places in percent of the track."""
     falls = _list(diagnosis, "falls")
@@ -430,6 +435,8 @@ def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:
                 "held_out": fall.get("held_out"),
                 "train_at": place(fall.get("train")),
                 "held_out_at": place(fall.get("held_out")),
+                "held_out_conditions": fall.get("held_out_conditions"),
+                "held_out_conditions_at": place(fall.get("held_out_conditions")),
                 "fitted": k > 0,
                 "dots": [
                     {"condition": c, "value": by_condition.get(c), "at": place(by_condition.get(c))}
@@ -454,6 +461,7 @@ def error_fall(diagnosis: Part | None) -> dict[str, Any] | None:
     marks = text.log_ticks(start, stop) if log else text.ticks(start, stop)
     return {
         "in_units": in_units,
+        "by_conditions": by_conditions(diagnosis),
         "rows": rows,
         "log": log,
         "floor": place(1.0),
