@@ -283,7 +283,17 @@ def needed_gain(
     if choice.search.problem.discrepancy:
         part = 0.0 if back else OWN_ERROR_PART
         return max(OWN_ERROR_CHANCE * limits.gain, part * base.fit.cost) * further
+    if scatter_is_a_guess(choice.search):
+        return max(limits.gain, HALF * base.fit.cost)
     return max(limits.gain, 0.0 if enough or back else WORTHWHILE * base.fit.cost) * further
+
+
+def scatter_is_a_guess(search: Search) -> bool:
+    """Whether nothing was repeated of a machine of others: then neither repeats nor chance tell an effect from what the
+    model's form is off by, and one must take half of the misfit.
+    """
+    problem = search.problem
+    return problem.rig.foreign and not (problem.discrepancy or problem.features.repeated)
 
 
 def _may_halve(
