@@ -439,6 +439,13 @@ def fit(
     except _NotWorth:
         z, complete = derivatives.z, False
     r = residual_at(z)
+    if rows is not None:
+        # What is drawn by so little may not arrive before a fit ends.
+        shown = np.linalg.norm(derivatives.at(z, r)[use], axis=0) > UNSEEN
+        unseen = ~shown & (prior_weights(coordinates) == 0.0) & (z != 0.0)
+        if unseen.any():
+            z = np.where(unseen, np.clip(0.0, bounds[0] + edge, bounds[1] - edge), z)
+            r = residual_at(z)
     if complete and not in_volts(model.parameters):  # a back-EMF tells the factor
         other = np.clip(Forces(coordinates, z).likeliest(priors), bounds[0] + edge, bounds[1] - edge)
         # Only where the priors alone would gain by it is it worth a simulation.
