@@ -33,7 +33,7 @@ class Made:
         discrepancy=True,
         features=SimpleNamespace(conditions=("slow", "fast"), blocks=(SimpleNamespace(n=5),), repeated=True),
     )
-    slow, sources = False, ("a", "b")
+    slow, sources = False, {"a": "a", "b": "b"}
 
     def __init__(self, *found: Candidate) -> None:
         self.found = {c.key: c for c in found}

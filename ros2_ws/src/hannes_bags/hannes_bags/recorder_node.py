@@ -188,7 +188,9 @@ class RecorderNode(HannesNode, Node):
 
     def _look_for_the_hand(self) -> None:
         """Say where a hand is whose topics are elsewhere than those that are recorded, while nothing of it comes."""
-        if self._begun - {self._clock, self._health} or time.monotonic() < self._elsewhere_at:
+        if self._leading not in self._wanted or self._begun - {self._clock, self._health}:
+            return
+        if time.monotonic() < self._elsewhere_at:
             return
         self._elsewhere_at = time.monotonic() + _ELSEWHERE_S
         seen = [

@@ -95,7 +95,7 @@ def add_effects(
         if not (base.names or search.slow):
             # Where the model as it is has taken over the effect, the way from there may end early.
             afresh = search.thoroughly().extend([base], [name], f"{name} afresh")
-            best = min(best, *map(search.polish, afresh), key=lambda c: c.penalised)
+            best = min(best, *afresh, key=lambda c: c.penalised)
     # As a diagnosis does: noise and scatter are estimated where the fit has come.
     first, (search, best) = search, search.fitted_afresh(best)
     best = search.with_spread(best)

@@ -252,7 +252,9 @@ def _thoroughly(choice: Choice, first: Candidate) -> Sequence[str]:
         hard = choice.best.far_off if choice.adequate else choice.best.pulled
     else:
         hard = choice.best.pulled and not adequate
-    return choice.sought if hard else () if adequate else first.names
+    if hard:
+        return choice.sought
+    return () if adequate else first.names
 
 
 def _ended_early(size: int, left: float, best: Candidate, limits: Chance) -> str:

@@ -11,7 +11,7 @@ from hannes_description.signals import SIGNALS
 from rich.table import Table
 
 from .cli_options import Bags, Json, Objects, RigFile, Scale, Topics
-from .prepare import joined, notes_of, without_outliers
+from .prepare import as_compared, notes_of
 from .session import trials_from
 from .trials import Trial
 
@@ -28,10 +28,8 @@ def trials(
 
     Nothing is simulated: a look at what an adapter, or a bag, gives before the first `compare`.
     """
-    machine, found = trials_from(bags, objects, rig, scale, topics)
-    if machine is not None:
-        found = joined(found, machine)
-    found = [without_outliers(trial) for trial in found]
+    machine, read_in = trials_from(bags, objects, rig, scale, topics)
+    found = as_compared(read_in, machine)
     read = [told(trial, "" if machine else SIGNALS["reference_position"].unit) for trial in found]
     notes = notes_of(found)
     if json:
@@ -58,16 +56,10 @@ def told(trial: Trial, unit: str = "") -> dict[str, Any]:
                 "starts": [c.start for c in own],
             }
         )
-    signals = [
-        {"name": "reference", "unit": unit, "samples": int(trial.reference.size), "rate": 1.0 / trial.period}
-        | _range(trial.reference)
-    ]
+    signals = [_signal("reference", unit, trial.reference, trial.period)]
     for name, (time, values) in trial.signals.items():
         step = float(np.median(np.diff(time))) if time.size > 1 else float("nan")
-        rate = 1.0 / step if step > 0.0 else None
-        signals.append(
-            {"name": name, "unit": trial.unit(name), "samples": int(time.size), "rate": rate} | _range(values)
-        )
+        signals.append(_signal(name, trial.unit(name), values, step))
     return {
         "name": trial.name,
         "recordings": [part.source or part.name for part in trial.parts] or [trial.source],
@@ -78,8 +70,15 @@ def told(trial: Trial, unit: str = "") -> dict[str, Any]:
     }
 
 
-def _range(values: Any) -> dict[str, float]:
-    return {"lowest": float(np.min(values)), "highest": float(np.max(values))}
+def _signal(name: str, unit: str, values: Any, step: float) -> dict[str, Any]:
+    return {
+        "name": name,
+        "unit": unit,
+        "samples": int(values.size),
+        "rate": 1.0 / step if step > 0.0 else None,
+        "lowest": float(np.min(values)),
+        "highest": float(np.max(values)),
+    }
 
 
 def _show(read: Sequence[dict[str, Any]], notes: Sequence[str]) -> None:

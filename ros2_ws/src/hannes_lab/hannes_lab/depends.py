@@ -28,6 +28,9 @@ BINS = 10
 OF_PLACE = {"position": 4, BRAKING: 2}
 """Times as many bins: what acts at a place does so on a small part of the way."""
 
+PLACES = (*OF_PLACE, INERTIA)
+"""Variables of which it counts what is alike in all passes of a place."""
+
 BAND = 1.15
 """A frequency is a band from so many times lower to so many times higher."""
 
@@ -86,17 +89,14 @@ class Dependence:
         """The variable and its share, in words."""
         where = "" if self.at is None or self.share == 0.0 else f" ({self.at:.2g} {self.unit})"
         share = f"{100 * self.share:.0f} %"
-        if self.variable in (*OF_PLACE, INERTIA) and self.share >= SHOWN > self.repeated:
+        if self.variable in PLACES and self.share >= SHOWN > self.repeated:
             share += f" ({100 * self.repeated:.0f} % alike in all passes)"
         return f"{self.variable.replace('_', ' ')}{where} {share}"
 
     def to_dict(self) -> dict[str, Any]:
         where = {} if self.at is None else {"at": self.at}
-        where |= (
-            {"repeated": self.repeated}
-            if self.variable in WORTH_SAYING and self.variable != FREQUENCY
-            else {}
-        )
+        if self.variable in PLACES:
+            where["repeated"] = self.repeated
         return where | {
             "variable": self.variable,
             "unit": self.unit,
@@ -161,7 +161,7 @@ def pointed_at(found: Sequence[Dependence]) -> str:
     with starts and stops is largest there.
     """
     for first in sorted(found, key=lambda d: -d.share):
-        worth = first.share if first.variable == FREQUENCY else first.repeated
+        worth = first.repeated if first.variable in PLACES else first.share
         if first.at is None or worth < WORTH_SAYING[first.variable]:
             return ""
         what = f"{100 * worth:.0f} % of what is left of {first.signal}"

@@ -441,8 +441,8 @@ def fit(
     r = residual_at(z)
     if rows is not None:
         # What is drawn by so little may not arrive before a fit ends.
-        shown = np.linalg.norm(derivatives.at(z, r)[use], axis=0) > UNSEEN
-        unseen = ~shown & (prior_weights(coordinates) == 0.0) & (z != 0.0)
+        moves = np.linalg.norm(derivatives.at(z, r)[use], axis=0)
+        unseen = (moves <= UNSEEN) & (prior_weights(coordinates) == 0.0) & (z != 0.0)
         if unseen.any():
             z = np.where(unseen, np.clip(0.0, bounds[0] + edge, bounds[1] - edge), z)
             r = residual_at(z)

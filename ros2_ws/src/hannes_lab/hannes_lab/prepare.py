@@ -124,9 +124,18 @@ def read_trials(rig: type[PlantRig], paths: Sequence[Path]) -> list[Trial]:
     return check_trials(found, rig.__name__)
 
 
-def joined(trials: Sequence[Trial], rig: type[PlantRig]) -> list[Trial]:
-    """A rig's trials, checked; those that repeat one condition as one, with closures that begin at the same moment."""
-    return [trial.aligned() for trial in join_trials(check_trials(trials, rig.__name__))]
+def as_compared(
+    trials: Sequence[Trial], rig: type[PlantRig] | None, *, typical: bool = False
+) -> Sequence[Trial]:
+    """Trials as they are held against a model, without closures far from the others.
+
+    Those of a rig are checked; those that repeat one condition become one, with closures that begin at the same moment.
+
+    typical  closures far from the others are left out already
+    """
+    if rig is not None:
+        trials = [trial.aligned() for trial in join_trials(check_trials(trials, rig.__name__))]
+    return trials if typical else [without_outliers(trial) for trial in trials]
 
 
 def without_outliers(trial: Trial) -> Trial:
@@ -181,10 +190,7 @@ def prepare(
     threads  among which the slow plant's simulations are divided while this process works alone
     typical  closures far from the others are left out already
     """
-    if rig is not None:
-        trials = joined(trials, rig)
-    if not typical:
-        trials = [without_outliers(trial) for trial in trials]
+    trials = as_compared(trials, rig, typical=typical)
     made: PlantRig = (rig or HandRig)(trials)
     check_parameters(made, model)
     check_own_code(made, model)

@@ -315,9 +315,11 @@ def lead(choice: Choice, falls: Sequence[Fall]) -> tuple[str, ...]:
         and len(c.names) == len(best.names) + 1
         and not disbelieved(search, c)
     ]
-    following = min(further, key=lambda c: c.penalised, default=None)
-    gain = best.penalised + PENALTY - following.penalised if following is not None else 0.0
-    if following is None or gain < LEAST_LEAD * choice.limits.gain:
+    if not further:
+        return ()
+    following = min(further, key=lambda c: c.penalised)
+    gain = best.penalised + PENALTY - following.penalised
+    if gain < LEAST_LEAD * choice.limits.gain:
         return ()
     (name,) = set(following.names) - set(best.names)
     asked = needed_gain(choice, best, following)
@@ -325,7 +327,7 @@ def lead(choice: Choice, falls: Sequence[Fall]) -> tuple[str, ...]:
         f"{worst.signal} of '{worst.condition}' is still missed by {worst.ratio:.1f} times the repeatability, which "
         f"the model of another machine may be off by. What would lower the misfit most is {name}, by {gain:.0f} "
         f"(chance: {choice.limits.gain:.0f}, and {asked:.0f} are asked for): no finding, but worth a look with "
-        f"`hannes add ... {' '.join(f'--effect {n}' for n in (*best.names, name))}`",
+        f"`hannes add ... {' '.join(f'--effect {search.sources[n]}' for n in (*best.names, name))}`",
     )
 
 

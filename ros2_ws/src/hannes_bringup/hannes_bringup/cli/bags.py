@@ -62,9 +62,11 @@ def record(
         parameters["metadata"] = json.dumps(said)
     if topic:
         parameters["topics"] = topic
-    if profile and namespace:
-        raise HannesError("--profile moves the hand of /hannes: start a controller in --namespace yourself.")
     if profile:
+        if namespace:
+            raise HannesError(
+                "--profile moves the hand of /hannes: start a controller in --namespace yourself."
+            )
         _record_profile(parameters, profile, closures or 13, period, amplitude, model, more or [])
     else:
         given = {"--closures": closures, "--period": period, "--amplitude": amplitude, "--model": model}
