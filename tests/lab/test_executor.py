@@ -15,28 +15,29 @@ import numpy as np
 import pytest
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.output import finite
 from hannes_lab.cache import NotPlain, Store, content_hash
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.executor import Executor
 from hannes_lab.features import Features
+from hannes_lab.fit import Fit
 from hannes_lab.hide import make_set, write_set
 from hannes_lab.prepare import Prepared, load_trials, prepare
 from hannes_lab.problem import Problem
-from hannes_lab.search import Search
+from hannes_lab.search import Candidate, Search
 from hannes_sim.effect import strength_of
 
 pytestmark = pytest.mark.slow
 
 ONLY = ["glove_stiffness", "wire_slack", "gravity"]
-QUICK = ("fast", "grasp_fast")
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("set")
     made, truth = make_set(
-        Model.load(), [strength_of("glove_stiffness", 1.0)], seed=401, closures=5, conditions=QUICK
+        Model.load(), [strength_of("glove_stiffness", 1.0)], seed=401, closures=4, conditions=("fast",)
     )
     write_set(made, truth, folder / "bags", folder / "truth.yaml")
     return folder / "bags"
@@ -99,9 +100,9 @@ def test_no_scheduler_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> Non
         Executor(dask="tcp://127.0.0.1:1").client()
 
 
-def test_a_second_run_takes_everything_from_the_store(
-    kept: tuple[Diagnosis, Path], prepared: Prepared, serial: Diagnosis, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def predictions(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How often the model was asked what it predicts, as its only item."""
     made, predict = [0], Features.predict
 
     def counted(*given: Any) -> Any:
@@ -109,8 +110,40 @@ def test_a_second_run_takes_everything_from_the_store(
         return predict(*given)
 
     monkeypatch.setattr(Features, "predict", counted)
+    return made
+
+
+def test_a_second_run_takes_everything_from_the_store(
+    kept: tuple[Diagnosis, Path], prepared: Prepared, serial: Diagnosis, predictions: list[int]
+) -> None:
     again = found_with(prepared, Executor(store=Store(kept[1])))
-    assert same(again, serial) and made[0] < 0.1 * serial.simulations
+    assert same(again, serial) and predictions[0] < 0.1 * serial.simulations
+
+
+def test_of_other_effects_that_are_looked_for_the_fits_are_found_again(
+    kept: tuple[Diagnosis, Path], prepared: Prepared, predictions: list[int]
+) -> None:
+    plain = found_with(prepared, Executor(), ONLY[:2])
+    anew, predictions[0] = predictions[0], 0
+    assert same(found_with(prepared, Executor(store=Store(kept[1])), ONLY[:2]), plain)
+    assert predictions[0] < 0.5 * anew
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_result_cannot_depend_on_effects_that_it_does_not_name(prepared: Prepared, jobs: int) -> None:
+    """What is kept is found by the effects of an item; the item sees no others."""
+    executor = Executor(jobs)
+    search = Search(
+        prepared.problem, prepared.model, prepared.nuisances, effect_sources(only=ONLY), executor=executor
+    )
+    null = Candidate((), Fit(prepared.model, (), np.zeros(0), 0.0, np.zeros(0), np.zeros((0, 0))), 0.0)
+    glove = replace(null, names=("glove_stiffness",))
+    seen = search.each(sees, [(null,), (glove,), (glove, "gravity")], "")
+    assert seen == [[], ["glove_stiffness"], ["glove_stiffness", "gravity"]]
+
+
+def sees(search: Search, *_: Any) -> list[str]:
+    return sorted(search.sources)
 
 
 def test_other_data_or_another_model_find_nothing_of_it(prepared: Prepared, tmp_path: Path) -> None:
@@ -260,7 +293,7 @@ def test_ctrl_c_in_the_first_round_and_the_same_command_goes_on(
     again = run_hannes(words, tmp_path)
     out, err = again.communicate()
     assert again.returncode == 0, err
-    found, expected = json.loads(out), json.loads(json.dumps(serial.to_dict()))
+    found, expected = json.loads(out), json.loads(json.dumps(finite(serial.to_dict())))
     assert found.pop("model_file") is None
     # The command counts those of the preparation too.
     assert found.pop("simulations") >= expected.pop("simulations")

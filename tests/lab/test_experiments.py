@@ -17,14 +17,16 @@ from hannes_lab.trials import Trial, make_trial
 from hannes_sim.effect import strength_of
 from hannes_sim.plant import PlantDiverged
 
+QUICK = ("fast", "grasp_fast")
 
-def distance_of_fits(prepared: Prepared, names: Sequence[str]) -> float:
+
+def distance_of_fits(prepared: Prepared, names: Sequence[str], executor: Executor) -> float:
     search = Search(
         prepared.problem,
         prepared.model,
         prepared.nuisances,
         effect_sources(only=names, model=prepared.model),
-        executor=Executor(1),
+        executor=executor,
     )
     search.null()
     tied = [search.fitted((name,)) for name in names]
@@ -34,29 +36,33 @@ def distance_of_fits(prepared: Prepared, names: Sequence[str]) -> float:
 @pytest.fixture(scope="module")
 def undescribed() -> Prepared:
     """Recordings of a hand on a slack wire that do not say how they were made."""
-    recordings, _ = make_set(Model.load(), [strength_of("wire_slack", 1.0)], seed=21, closures=6)
+    recordings, _ = make_set(
+        Model.load(), [strength_of("wire_slack", 1.0)], seed=21, closures=4, conditions=QUICK
+    )
     trials = [make_trial(r) for r in recordings]
     return prepare([replace(t, options={"object": t.options["object"]}) for t in trials], Model.load())
 
 
-def test_nothing_recorded_in_operation_tells_slack_from_an_encoder_offset(undescribed: Prepared) -> None:
-    only = ["wire_slack", "encoder_offset", "gravity"]
-    found = diagnose(undescribed, effect_sources(only=only, model=undescribed.model))
+def test_nothing_recorded_in_operation_tells_slack_from_an_encoder_offset(
+    undescribed: Prepared, executor: Executor
+) -> None:
+    only = ["wire_slack", "encoder_offset"]
+    found = diagnose(undescribed, effect_sources(only=only, model=undescribed.model), executor=executor)
     assert set(found.tied) == {("wire_slack",), ("encoder_offset",)}
     assert found.experiments[0].distance < VISIBLE
     (note,) = (n for n in found.notes if "no further recording" in n)
     assert "the encoder read before the controller is on" in note
 
 
-def test_another_recording_tells_slack_from_a_glove(undescribed: Prepared) -> None:
-    assert distance_of_fits(undescribed, ["wire_slack", "glove_stiffness"]) > VISIBLE
+def test_another_recording_tells_slack_from_a_glove(undescribed: Prepared, executor: Executor) -> None:
+    assert distance_of_fits(undescribed, ["wire_slack", "glove_stiffness"], executor) > VISIBLE
 
 
 @pytest.fixture(scope="module")
-def tied(undescribed: Prepared) -> tuple[Search, list[Candidate]]:
+def tied(undescribed: Prepared, executor: Executor) -> tuple[Search, list[Candidate]]:
     """A search, and two of its sets that are taken to tie."""
     found = undescribed
-    search = Search(found.problem, found.model, found.nuisances, effect_sources(only=["gravity"]))
+    search = Search(found.problem, found.model, found.nuisances, effect_sources(only=["gravity"]), executor)
     return search, [search.null(), search.add(search.null(), "gravity")]
 
 

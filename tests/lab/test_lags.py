@@ -28,7 +28,7 @@ def late(trials: list[Trial], by: Mapping[str, float]) -> list[Trial]:
 @pytest.fixture(scope="module")
 def trials() -> list[Trial]:
     recordings, _ = make_set(
-        Model.load(), [strength_of("glove_stiffness", 1.0)], seed=102, closures=8, conditions=QUICK
+        Model.load(), [strength_of("glove_stiffness", 1.0)], seed=102, closures=4, conditions=QUICK
     )
     return [make_trial(r) for r in recordings]
 

@@ -16,6 +16,7 @@ from hannes_description.units import linear_unit
 from hannes_lab.compare import Comparison, compare
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Fall
+from hannes_lab.executor import Executor
 from hannes_lab.falls import error_falls
 from hannes_lab.features import compact_end
 from hannes_lab.fit import Fit, finite_differences, fit, prior_weights
@@ -272,8 +273,8 @@ def test_what_only_scales_with_all_else_is_led_back_to_its_tolerance(prepared: P
 
 
 @pytest.mark.slow
-def test_greedy_search_finds_friction_and_ripple_and_stops(prepared: Prepared) -> None:
-    found = diagnose(prepared, effect_sources(only=CONSIDERED), greedy=True, max_effects=6)
+def test_greedy_search_finds_friction_and_ripple_and_stops(prepared: Prepared, executor: Executor) -> None:
+    found = diagnose(prepared, effect_sources(only=CONSIDERED), greedy=True, max_effects=6, executor=executor)
     assert found.verdict == "effects"
     assert [e.name for e in found.effects] == ["coulomb_friction", "cogging"]
     friction, ripple = (e.parameters for e in found.effects)
@@ -366,9 +367,11 @@ def test_units_scale_by_dimension() -> None:
             assert p.lower <= p.typical <= p.upper, f"{effect.name}.{p.name}"
 
 
-def test_what_the_table_shows_decides_whether_an_effect_joins(prepared: Prepared) -> None:
+def test_what_the_table_shows_decides_whether_an_effect_joins(prepared: Prepared, executor: Executor) -> None:
     """The rule of --greedy, on the printed numbers: each effect takes 15 % of the mean square."""
-    found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]), greedy=True)
+    found = diagnose(
+        prepared, effect_sources(only=["coulomb_friction", "cogging"]), greedy=True, executor=executor
+    )
     errors = [fall.held_out_conditions for fall in found.falls[1:]]
     assert len(errors) == 3
     assert all(b**2 <= 0.85 * a**2 for a, b in itertools.pairwise(errors))
@@ -388,31 +391,33 @@ def test_one_mass_has_no_part_of_a_friction_beyond_a_wire(recording: Path) -> No
     assert [p.name for p in made.effect(capstan).parameters] == ["coefficient", "share"]
 
 
-def test_little_explained_is_unknown(prepared: Prepared) -> None:
+def test_little_explained_is_unknown(prepared: Prepared, executor: Executor) -> None:
     """A ripple beside dry friction of five times its size: alone it is no answer, though the error falls."""
-    found = diagnose(prepared, effect_sources(only=["cogging", "command_delay"]), greedy=True)
+    found = diagnose(
+        prepared, effect_sources(only=["cogging", "command_delay"]), greedy=True, executor=executor
+    )
     assert found.verdict == "unknown"
     assert "not one of those that were looked for (cogging, command_delay)" in found.summary
     assert "more than half is left" in found.summary
 
 
-def test_unknown_without_greedy_says_what_else_can_be_done(prepared: Prepared) -> None:
+def test_unknown_without_greedy_says_what_else_can_be_done(prepared: Prepared, executor: Executor) -> None:
     sources = effect_sources(only=["command_delay"])
-    found = diagnose(prepared, sources, greedy=False)
+    found = diagnose(prepared, sources, greedy=False, executor=executor)
     assert found.verdict == "unknown" and any("--greedy adds effects" in note for note in found.notes)
-    assert not any("--greedy adds" in note for note in diagnose(prepared, sources).notes)
+    assert not any("--greedy adds" in note for note in diagnose(prepared, sources, executor=executor).notes)
 
 
-def test_the_model_file_says_what_is_printed(prepared: Prepared, tmp_path: Path) -> None:
+def test_the_model_file_says_what_is_printed(prepared: Prepared, tmp_path: Path, executor: Executor) -> None:
     """Also where nothing was added: the file then holds the parameters with which the error was found."""
-    found = diagnose(prepared, effect_sources(only=["coulomb_friction"]), greedy=True)
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction"]), greedy=True, executor=executor)
     (effect,) = found.effects
     (entry,) = Model.load(found.model.save(tmp_path / "mass.yaml")).effects
     level, written = effect.parameters["level"], entry.parameters["level"]
     assert written.value == level.value and written.upper > 2.0 * level.high, "its range stays what it was"
     spans = Model.load(tmp_path / "mass.yaml").provenance["intervals_95"]
     assert spans["coulomb_friction.level"] == pytest.approx((level.low, level.high), rel=1e-4)
-    alone = diagnose(prepared, effect_sources(only=["gear_backlash"]), greedy=True)
+    alone = diagnose(prepared, effect_sources(only=["gear_backlash"]), greedy=True, executor=executor)
     assert not alone.effects
     assert alone.model.parameters.value("motor.armature") == alone.values["motor.armature"] != 2.0
 
@@ -476,23 +481,23 @@ def test_signals_by_another_clock_than_the_reference_are_noticed_and_can_be_fitt
 
 
 def test_an_error_as_small_as_the_machine_repeats_leaves_nothing_to_look_for(
-    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch, executor: Executor
 ) -> None:
     """Of a real machine chance never explains the rest; on --greedy the error on other conditions decides."""
     sources = effect_sources(only=["coulomb_friction"])
     for module in ("choose", "greedy"):
         monkeypatch.setattr(f"hannes_lab.{module}.AS_IT_REPEATS", 1e6)
-    found = diagnose(prepared, sources)
+    found = diagnose(prepared, sources, executor=executor)
     assert found.verdict == "nothing" and not found.effects, "though the effect would lower it"
     assert "as close to the recordings as they repeat" in found.summary and "chance" not in found.summary
     assert any("leaves nothing to look for" in note for note in found.notes)
 
 
 def test_an_effect_that_the_data_leave_open_must_take_half_of_the_error(
-    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch, executor: Executor
 ) -> None:
     only = effect_sources(only=["coulomb_friction", "cogging"])
-    both = diagnose(prepared, only)
+    both = diagnose(prepared, only, executor=executor)
     assert [effect.name for effect in both.effects] == ["coulomb_friction", "cogging"]
     before, after = (fall.held_out_conditions for fall in both.falls[-2:])
     monkeypatch.setattr(
@@ -500,7 +505,7 @@ def test_an_effect_that_the_data_leave_open_must_take_half_of_the_error(
         lambda search, c, base: "cogging.period" if c.names[-1] == "cogging" else "",
     )
     monkeypatch.setattr("hannes_lab.greedy.LEFT_OPEN", 0.9 * (after / before) ** 2)
-    cut = diagnose(prepared, only)
+    cut = diagnose(prepared, only, executor=executor)
     assert [effect.name for effect in cut.effects] == ["coulomb_friction"]
     assert any("for the data leave cogging.period open" in note for note in cut.notes)
 
@@ -514,8 +519,8 @@ def cogging_may_be_nought(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("cogging_may_be_nought")
-def test_an_effect_that_may_be_nought_at_the_end_is_left_out(prepared: Prepared) -> None:
-    found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]))
+def test_an_effect_that_may_be_nought_at_the_end_is_left_out(prepared: Prepared, executor: Executor) -> None:
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]), executor=executor)
     assert [effect.name for effect in found.effects] == ["coulomb_friction"] and found.verdict == "effects"
     assert found.tied == (("coulomb_friction",),) and found.falls[-1].added == "coulomb_friction"
     assert any("cogging joined too" in note for note in found.notes)
@@ -524,23 +529,23 @@ def test_an_effect_that_may_be_nought_at_the_end_is_left_out(prepared: Prepared)
 
 @pytest.mark.usefixtures("cogging_may_be_nought")
 def test_what_is_left_of_a_pair_is_judged_by_itself(
-    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch, executor: Executor
 ) -> None:
     """Of a pair one may be nought at its end: then the other one must have lowered the error without it."""
     monkeypatch.setattr("hannes_lab.diagnose.EACH_TAKES", 0.9999)
-    found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]))
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]), executor=executor)
     assert found.verdict == "unknown" and not found.effects and not found.tied
     assert any("coulomb_friction joined too" in n and "must fall by 100 %" in n for n in found.notes)
     assert len(found.falls) == 2 and not found.model.effects
 
 
 def test_where_all_that_joined_may_be_nought_nothing_is_named(
-    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch, executor: Executor
 ) -> None:
     monkeypatch.setattr("hannes_lab.diagnose._may_be_nought", lambda search, found, limits: True)
     for module in ("diagnose", "choose"):  # as of data that the model alone explains
         monkeypatch.setattr(f"hannes_lab.{module}.is_adequate", lambda *args, **how: True)
-    found = diagnose(prepared, effect_sources(only=["coulomb_friction"]))
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction"]), executor=executor)
     assert found.verdict == "nothing" and not found.effects and not found.model.effects
     assert any("coulomb_friction joined too, but" in note for note in found.notes)
 
@@ -577,14 +582,14 @@ def test_a_fit_stays_inside_the_bounds_of_the_parameters_file(tmp_path: Path) ->
 
 
 def test_an_effect_with_which_left_out_closures_are_foretold_worse_is_left_out(
-    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch, executor: Executor
 ) -> None:
     def risen(*given: Any, **how: Any) -> tuple[Fall, ...]:
         falls = error_falls(*given, **how)
         return (*falls[:-1], replace(falls[-1], held_out=1.1 * falls[-2].held_out))
 
     monkeypatch.setattr("hannes_lab.diagnose.error_falls", risen)
-    found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]))
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction", "cogging"]), executor=executor)
     assert [effect.name for effect in found.effects] == ["coulomb_friction"]
     assert any("cogging joined too, but the error on held-out closures rises" in note for note in found.notes)
 

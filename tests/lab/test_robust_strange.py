@@ -56,7 +56,7 @@ def strange_set(folder: Path, *effects: str, names: Sequence[str] = ("fast", "gr
         model=Model.load().with_values(STRANGE),
         effects=[strength_of(name, 1.0) for name in effects],
         conditions=names,
-        closures=6,
+        closures=4,
         seed=11,
     )
     return load_trials([write_set(folder / "bags", conditions, late)])
@@ -103,7 +103,7 @@ def test_a_strange_hand_lacks_nothing(tmp_path: Path) -> None:
 def test_a_strange_hand_may_rest_off_its_open_stop(tmp_path: Path) -> None:
     """The controller sees the encoder only: where that reads too little, the wire is wound up by as much."""
     two = ("fast", "grasp_fast")
-    wound = signals_of_set(effects=[offset_of(-1.2)], conditions=two, closures=6, seed=11)
+    wound = signals_of_set(effects=[offset_of(-1.2)], conditions=two, closures=4, seed=11)
     prepared = prepare(load_trials([write_set(tmp_path / "bags", wound)]), Model.load())
 
     def null(without: str = "") -> Fit:
@@ -186,21 +186,27 @@ def test_compare_fits_a_strange_hand_as_a_diagnosis_does(tmp_path: Path) -> None
 @pytest.mark.slow
 def test_the_damping_of_an_object_that_nobody_described_is_an_effect_where_it_is_large(
     tmp_path: Path,
+    executor: Executor,
 ) -> None:
     """As a parameter of the recording it charges less than an effect must gain."""
     damping = load_effect("object_damping").entry({"coefficient": 0.02})
     two = ("fast", "grasp_soft")
-    conditions = signals_of_set(effects=[damping], conditions=two, closures=6, seed=11)
+    conditions = signals_of_set(effects=[damping], conditions=two, closures=4, seed=11)
     prepared = prepare(load_trials([write_set(tmp_path / "bags", conditions)]), Model.load())
     own = [n for n in prepared.nuisances if n.effect]
     assert [n.name for n in own] == ["object.damping@grasp_soft"]
 
-    found = diagnose(prepared, effect_sources(only=["object_damping", "viscous_friction"]), max_effects=1)
+    found = diagnose(
+        prepared,
+        effect_sources(only=["object_damping", "viscous_friction"]),
+        max_effects=1,
+        executor=executor,
+    )
     assert found.verdict == "effects" and [e.name for e in found.effects] == ["object_damping"]
     assert found.effects[0].parameters["coefficient"].value == pytest.approx(0.02, rel=0.25)
     assert own[0].name not in found.nuisances
     assert any(f"{own[0].name} would do the same" in note for note in found.notes)
-    other = diagnose(prepared, effect_sources(only=["viscous_friction"]), max_effects=1)
+    other = diagnose(prepared, effect_sources(only=["viscous_friction"]), max_effects=1, executor=executor)
     assert other.verdict == "nothing", "no effect of that name is considered"
     assert other.nuisances[own[0].name]["value"] == pytest.approx(0.02, rel=0.5), "taken over"
 
@@ -235,7 +241,7 @@ def test_a_slack_is_found_on_a_hand_of_half_the_friction(tmp_path: Path) -> None
         model=Model.load().with_values(light),
         effects=[slack],
         conditions=("fast", "grasp"),
-        closures=6,
+        closures=4,
         seed=11,
         sensors="bench",
     )
@@ -434,7 +440,7 @@ def test_a_hand_that_stops_a_little_elsewhere_each_time_is_simulated_once(tmp_pa
 def test_another_hands_rotor_is_fitted_and_is_no_torque_constant(tmp_path: Path) -> None:
     """Held at the data sheet's inertia, a weaker motor would make up for a heavier rotor."""
     model = Model.load().with_values({**STRANGE, "motor.armature": 1.25e-6})
-    conditions = signals_of_set(model=model, conditions=("slow", "fast"), closures=6, seed=12)
+    conditions = signals_of_set(model=model, conditions=("slow", "fast"), closures=4, seed=12)
     prepared = prepare(load_trials([write_set(tmp_path / "bags", conditions, late)]), Model.load())
     fit = Search(prepared.problem, prepared.model, prepared.nuisances, {}).null().fit
     assert fit.values["motor.armature"] == pytest.approx(1.25e-6, rel=0.06)
@@ -509,7 +515,7 @@ def test_a_set_that_needs_a_hand_far_outside_the_tolerances_explains_nothing(tmp
 def test_an_outer_loop_that_integrates_is_seen_and_is_no_effect(tmp_path: Path) -> None:
     conditions = signals_of_set(
         model=Model.load().with_values({**STRANGE, "control.ki": 0.4}),
-        conditions=("slow", "grasp"),
+        conditions=("slow", "grasp_fast"),
         closures=4,
         seed=11,
     )

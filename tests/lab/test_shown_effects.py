@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.executor import Executor
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.rig import load_rig
 from hannes_sim.effect import load_effect
@@ -21,7 +22,7 @@ SHOWN = Path(__file__).parents[2] / "examples" / "effects"
 WHOLE, PART, HERTZ, DAMPING = 2.1, 0.7, 6.0, 0.04
 
 
-def quick(laps: int = 6) -> np.ndarray:
+def quick(laps: int = 4) -> np.ndarray:
     """Ramps of 0.1 m in 0.2 s and 0.05 m in 0.3 s there, and in 0.5 and 0.4 s back, with stands of 1 s."""
     ways = [(0.0, 0.1, 200), (0.1, 0.0, 500), (0.0, 0.05, 300), (0.05, 0.0, 400)]
     lap = np.concatenate([np.append(np.linspace(a, b, n), np.full(1000, b)) for a, b, n in ways])
@@ -60,9 +61,9 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
     return prepare(rig.read([path]), Model.load(path.parent / "mass.yaml"), rig=rig)
 
 
-def test_what_swings_is_unknown_and_its_frequency_is_said(prepared: Prepared) -> None:
+def test_what_swings_is_unknown_and_its_frequency_is_said(prepared: Prepared, executor: Executor) -> None:
     only = ["coulomb_friction", "cogging", "command_delay", "gearbox_inertia"]
-    found = diagnose(prepared, effect_sources(only=only, model=prepared.model))
+    found = diagnose(prepared, effect_sources(only=only, model=prepared.model), executor=executor)
     assert found.verdict == "unknown"
     first = found.depends_on[0]
     # Of the whole machine in its loop: the load's own frequency with the motor held is a little lower.
@@ -70,12 +71,16 @@ def test_what_swings_is_unknown_and_its_frequency_is_said(prepared: Prepared) ->
     assert any("oscillates at" in note for note in found.notes)
 
 
-def test_with_the_effect_that_is_shown_it_is_found(prepared: Prepared, tmp_path: Path) -> None:
+def test_with_the_effect_that_is_shown_it_is_found(
+    prepared: Prepared, tmp_path: Path, executor: Executor
+) -> None:
     mine = tmp_path / "elastic.py"
     text = (SHOWN / "elastic_load.py").read_text().replace("INERTIA = 0.04\n", "INERTIA = 0.5\n")
     mine.write_text(text.replace("FREQUENCY = 6.0\n", "FREQUENCY = 7.0\n"))
     source = f"{mine}:ElasticLoad"
-    found = diagnose(prepared, effect_sources(only=["coulomb_friction", source], model=prepared.model))
+    found = diagnose(
+        prepared, effect_sources(only=["coulomb_friction", source], model=prepared.model), executor=executor
+    )
     (effect,) = found.effects
     assert effect.name == "elastic_load"
     for name, true in (("inertia", PART), ("frequency", HERTZ), ("damping", DAMPING)):
@@ -110,7 +115,14 @@ HERE = {"level": 3.0, "place": 0.04, "width": 0.008}
     ],
 )
 def test_what_acts_by_place_is_said_to_and_found(
-    tmp_path: Path, file: str, kind: str, guess: str, mine: str, values: dict[str, float], variable: str
+    tmp_path: Path,
+    file: str,
+    kind: str,
+    guess: str,
+    mine: str,
+    values: dict[str, float],
+    variable: str,
+    executor: Executor,
 ) -> None:
     """What rubs with 3 N at 40 mm of the way, both ways; or pulls there; or 2 kg that are up to 0.6 kg more or less."""
     write_files(tmp_path)
@@ -121,14 +133,14 @@ def test_what_acts_by_place_is_said_to_and_found(
     own.write_text(text.replace(f" = {guess}\n", f" = {mine}\n"))
     source = f"{own}:{kind}"
     acts = load_effect(source).entry(values, source=source)
-    run = rollout(make_plant(model.with_effect(acts)), rig([]).controller(model, 1e-3), reference(5))
+    run = rollout(make_plant(model.with_effect(acts)), rig([]).controller(model, 1e-3), reference(3))
     rng = np.random.default_rng(2)
     position = run.encoder_position + 2e-6 * rng.standard_normal(run.time.size)
     force = run.motor_voltage + 0.05 * rng.standard_normal(run.time.size)
     np.savez(tmp_path / "mass.npz", reference=run.reference_position, position=position, force=force)
     prepared = prepare(rig.read([tmp_path / "mass.npz"]), model, rig=rig)
     only = ["cogging", "stribeck_friction", "direction_dependent_friction"]
-    found = diagnose(prepared, effect_sources(only=only, model=prepared.model))
+    found = diagnose(prepared, effect_sources(only=only, model=prepared.model), executor=executor)
     assert found.verdict == "unknown"
     first = found.depends_on[0]
     assert first.variable == variable
@@ -145,7 +157,9 @@ def test_what_acts_by_place_is_said_to_and_found(
         "frequency": "Hz",
     }
     assert file in found.notes[0]
-    found = diagnose(prepared, effect_sources(only=["stribeck_friction", source], model=prepared.model))
+    found = diagnose(
+        prepared, effect_sources(only=["stribeck_friction", source], model=prepared.model), executor=executor
+    )
     (effect,) = found.effects
     for name, true in values.items():
         assert effect.parameters[name].value == pytest.approx(true, rel=0.03), name

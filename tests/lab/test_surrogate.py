@@ -104,7 +104,7 @@ def test_what_is_unknown_of_a_recording_of_others_can_be_moved_on_every_plant(tr
 
 @pytest.mark.slow
 def test_the_full_hand_fits_its_own_recordings_also_without_a_description():
-    recordings, _ = make_set(FULL, [], seed=31, closures=6, conditions=("fast", "grasp_fast"))
+    recordings, _ = make_set(FULL, [], seed=31, closures=4, conditions=("grasp_fast",))
     trials = [make_trial(r) for r in recordings]
     strange = [replace(t, options={k: v for k, v in t.options.items() if k != "sensors"}) for t in trials]
     prepared = prepare(strange, FULL, surrogate=True)

@@ -710,12 +710,14 @@ class Search:
             bare = replace(self, executor=Executor(), progress=silent)
             for k in missing:
                 before = self.problem.simulations, self.problem.failures
-                result = function(bare, *items[k])
+                result = function(bare._knowing(items[k]), *items[k])
                 yield k, (result, self.problem.simulations - before[0], self.problem.failures - before[1])
             return
         work = [(function, items[k]) for k in missing]
         key = f"{next(_runs)} {id(self)} {os.getpid()} {time.time_ns()}"
-        for number, made in self.executor.run(_work, (*self._shared, self._nominal, self._minima), key, work):
+        for number, made in self.executor.run(
+            _work, (*self._shared, dict(self.sources), self._nominal, self._minima), key, work
+        ):
             self._count(*made[1:])
             yield missing[number], made
 
@@ -725,9 +727,18 @@ class Search:
 
     @property
     def _shared(self) -> tuple[Any, ...]:
-        """What the result of every item depends on, beside the other minima of the model as it is."""
-        sources = dict(self.sources)
-        return (self.problem, self.model, tuple(self.nuisances), sources, self.thorough)
+        """What the result of every item depends on, beside its effects and the other minima of the model as it is."""
+        return (self.problem, self.model, tuple(self.nuisances), self.thorough)
+
+    def _sources_of(self, item: tuple[Any, ...]) -> dict[str, str]:
+        """Of the effects that an item names: what else is looked for changes no result of it."""
+        sets = (part.names if isinstance(part, Candidate) else (part,) for part in item)
+        names = {name for some in sets for name in some if isinstance(name, str)}
+        return {name: self.sources[name] for name in sorted(names & self.sources.keys())}
+
+    def _knowing(self, item: tuple[Any, ...]) -> Search:
+        """This search for one item: it knows the effects that the item's key is made of, and no others."""
+        return replace(self, sources=self._sources_of(item))
 
     @property
     def _codec(self) -> Codec:
@@ -740,7 +751,8 @@ class Search:
             self._key = self._key or content_hash(code_hash(), *self._shared)
             minima = content_hash([(k.hex(), fits) for k, fits in sorted(self._minima.items())])
             for k, item in enumerate(items):
-                out[k] = content_hash(self._key, minima, function.__module__, function.__qualname__, item)
+                sources, called = self._sources_of(item), (function.__module__, function.__qualname__)
+                out[k] = content_hash(self._key, minima, *called, sources, item)
         return out
 
     def _stored(self, store: Store, key: str) -> Any | None:
@@ -783,7 +795,7 @@ def _work(
     """One item in a worker, which keeps the search for the next ones: (result, simulations, failures)."""
 
     def build() -> Search:
-        problem, model, nuisances, sources, thorough, points, minima = shared
+        problem, model, nuisances, thorough, sources, points, minima = shared
         problem = replace(problem, rig=own(problem.rig), counts=Counts())
         return Search(
             problem,
@@ -798,7 +810,7 @@ def _work(
     search = _held.get(key, build)
     counts = search.problem.counts
     counts.simulations = counts.failures = 0
-    result = function(search, *item)
+    result = function(search._knowing(item), *item)
     return result, counts.simulations, counts.failures
 
 
