@@ -19,6 +19,7 @@ from hannes_lab.compare import compare
 from hannes_lab.diagnose import diagnose, effect_sources, found_effects, without_idle, without_law
 from hannes_lab.diagnosis import Diagnosis, Fall, FoundEffect
 from hannes_lab.errors import SignalError
+from hannes_lab.executor import Executor
 from hannes_lab.falls import fall_sentence, relative_errors, worth_showing
 from hannes_lab.fit import Fit, fit
 from hannes_lab.hide import DEFAULT_CONDITIONS, Truth, make_set
@@ -64,8 +65,8 @@ def data(
     return prepare([make_trial(r) for r in recordings], model), truth
 
 
-def run(prepared: Prepared, only: Sequence[str] | None = None) -> Diagnosis:
-    return diagnose(prepared, effect_sources(only=only, model=prepared.model))
+def run(prepared: Prepared, only: Sequence[str] | None = None, executor: Executor | None = None) -> Diagnosis:
+    return diagnose(prepared, effect_sources(only=only, model=prepared.model), executor=executor)
 
 
 SPRINGS = (
@@ -84,11 +85,21 @@ INERTIAS = (
 
 
 @pytest.fixture(scope="module")
-def gloved() -> Search:
+def latched(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+    """A hand with an effect outside the catalogue."""
+    file = tmp_path_factory.mktemp("latch") / "latch.py"
+    file.write_text(OUTSIDE)
+    return data([f"{file}:Flap"], seed=105, conditions=QUICK[1:])[0]
+
+
+@pytest.fixture(scope="module")
+def gloved(executor: Executor) -> Search:
     """A search for a glove that is hidden, with the fits of no effect, of the glove, and of gravity and the glove."""
     prepared, _ = data(["glove_stiffness"], seed=102, conditions=QUICK)
     names = ["glove_stiffness", "gravity", "wire_slack"]
-    search = Search(prepared.problem, prepared.model, prepared.nuisances, effect_sources(only=names))
+    search = Search(
+        prepared.problem, prepared.model, prepared.nuisances, effect_sources(only=names), executor
+    )
     search.fitted(("glove_stiffness",))
     search.fitted(("gravity", "glove_stiffness"))
     return search
@@ -132,10 +143,10 @@ def test_nothing_is_missing_in_clean_data() -> None:
     ],
 )
 def test_a_hidden_effect_is_named_its_parameter_recovered_and_the_error_falls(
-    name: str, seed: int, only: Sequence[str]
+    name: str, seed: int, only: Sequence[str], executor: Executor
 ) -> None:
     prepared, truth = data([name], seed, conditions=QUICK)
-    found = run(prepared, only)
+    found = run(prepared, only, executor)
     assert found.verdict == "effects"
     assert [e.name for e in found.effects] == [name]
     assert len(found.tied) <= 2
@@ -402,11 +413,9 @@ def test_one_closure_is_said_to_hold_nothing_out() -> None:
 
 
 @pytest.mark.slow
-def test_an_effect_outside_the_catalogue_is_called_unknown(tmp_path: Path) -> None:
-    file = tmp_path / "latch.py"
-    file.write_text(OUTSIDE)
-    prepared, _ = data([f"{file}:Flap"], seed=105, conditions=QUICK[1:])
-    found = diagnose(prepared, effect_sources(model=prepared.model), max_effects=1)
+def test_an_effect_outside_the_catalogue_is_called_unknown(latched: Prepared, executor: Executor) -> None:
+    sources = effect_sources(model=latched.model)
+    found = diagnose(latched, sources, max_effects=1, executor=executor)
     assert found.verdict == "unknown"
     assert "not in the catalogue" in found.summary
     variables = {"position", "velocity", "direction", "load", "time"}
@@ -414,25 +423,28 @@ def test_an_effect_outside_the_catalogue_is_called_unknown(tmp_path: Path) -> No
     assert {d.variable for d in found.depends_on} == variables
 
 
-def test_triples_are_not_tried_where_the_pairs_lead_nowhere(tmp_path: Path) -> None:
-    file = tmp_path / "latch.py"
-    file.write_text(OUTSIDE)
-    prepared, _ = data([f"{file}:Flap"], seed=106, conditions=QUICK[1:])
+def test_triples_are_not_tried_where_the_pairs_lead_nowhere(latched: Prepared, executor: Executor) -> None:
     only = ["gravity", "glove_stiffness", "encoder_offset", "return_preload"]
     texts = set[str]()
-    found = diagnose(prepared, effect_sources(only=only), progress=lambda done, total, text: texts.add(text))
+    found = diagnose(
+        latched,
+        effect_sources(only=only),
+        progress=lambda done, total, text: texts.add(text),
+        executor=executor,
+    )
     assert found.verdict == "unknown"
     assert any("sets of more effects were not tried" in note for note in found.notes)
     assert any("two effects" in text for text in texts) and not any("three" in text for text in texts)
     assert not any("--greedy" in note for note in found.notes), "which needs a second condition"
 
 
-def test_a_parameter_at_the_end_of_its_range_is_pointed_out(tmp_path: Path) -> None:
-    file, narrow = tmp_path / "latch.py", tmp_path / "narrow.py"
-    file.write_text(OUTSIDE)
+def test_a_parameter_at_the_end_of_its_range_is_pointed_out(
+    latched: Prepared, executor: Executor, tmp_path: Path
+) -> None:
+    narrow = tmp_path / "narrow.py"
     narrow.write_text(OUTSIDE.replace('"N.m", 0.0, 1.0, 0.05', '"N.m", 0.0, 0.025, 0.01'))
-    prepared, _ = data([f"{file}:Flap"], seed=105, conditions=QUICK[1:])
-    found = diagnose(prepared, effect_sources([f"{narrow}:Flap"], only=[]), max_effects=1)
+    sources = effect_sources([f"{narrow}:Flap"], only=[])
+    found = diagnose(latched, sources, max_effects=1, executor=executor)
     assert found.effects[0].parameters["torque"].value == pytest.approx(0.025, rel=1e-3)
     assert not found.effects[0].parameters["torque"].identified
     assert any("latch.torque lies at the end of its range (0 to 0.025 N.m)" in note for note in found.notes)
@@ -458,9 +470,10 @@ def test_the_users_own_effect_is_a_full_citizen(tmp_path: Path) -> None:
     assert addition.falls[-1].held_out <= 1.3
 
 
-def test_add_writes_a_model_whose_error_is_low_as_given(tmp_path: Path) -> None:
-    prepared, _ = data(["glove_stiffness"], 106, conditions=QUICK)
-    addition = add_effects(prepared, effect_sources(only=["glove_stiffness"], model=prepared.model))
+def test_add_writes_a_model_whose_error_is_low_as_given(tmp_path: Path, executor: Executor) -> None:
+    prepared, _ = data(["glove_stiffness"], 102, conditions=QUICK)
+    sources = effect_sources(only=["glove_stiffness"], model=prepared.model)
+    addition = add_effects(prepared, sources, executor=executor)
     model = Model.load(addition.model.save(tmp_path / "hand.yaml"))
     before = compare(prepared)
     after = compare(prepare(prepared.features.trials, model))
