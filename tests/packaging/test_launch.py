@@ -7,11 +7,13 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from time import sleep
 
 import pytest
 import yaml
 from hannes_bringup.cli.run import LAUNCH_FILE, NODES
 from hannes_bringup.launch_file import read_arguments, read_launch_file
+from hannes_bringup.processes import QUIET_FROM_THE_START, ProcessGroup
 from hannes_bringup.ros2_standin import find_command, launch_path, main, share_folder
 from hannes_description.errors import HannesError
 from patience import PATIENCE
@@ -257,3 +259,24 @@ def test_launch_refuses_python_files_and_unknown_names(capsys: pytest.CaptureFix
     assert "real `ros2 launch`" in capsys.readouterr().err
     assert main(["launch", "hannes_bringup", "foot.launch.yaml"]) == 2
     assert LAUNCH_FILE in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("after", [0.0, 0.01, 0.02, 0.04])
+def test_a_node_that_is_stopped_while_python_starts_says_nothing(
+    after: float, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Ctrl-C within the first second of a graph printed a traceback of Python's own start for each node."""
+    code = f"{QUIET_FROM_THE_START}import time; time.sleep(60)"
+    with ProcessGroup(lambda text: None, os.environ) as group:
+        for name in ("one", "two"):
+            group.start(name, [sys.executable, "-c", code])
+        sleep(after)
+        codes = group.stop()
+    assert codes == {"one": 0, "two": 0} and capfd.readouterr() == ("", "")
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, []), "here it is not held back"
+
+
+def test_ctrl_c_reaches_a_program_that_knows_nothing_of_it() -> None:
+    with ProcessGroup(lambda text: None, os.environ) as group:
+        group.start("plain", ["sleep", "60"])
+        assert group.stop() == {"plain": -signal.SIGINT}

@@ -19,6 +19,16 @@ GRACE_SIGTERM = 5.0
 POLL = 0.05
 """s between two looks at the processes."""
 
+QUIET_FROM_THE_START = (
+    "import os, signal, sys\n"
+    "for number in (signal.SIGINT, signal.SIGTERM):\n"
+    "    signal.signal(number, lambda *_: os._exit(0))\n"
+    "signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])\n"
+)
+"""What the code of `python -c` begins with so that a signal during its imports ends it as quietly as a later one.
+
+A `ProcessGroup` holds SIGINT back from such a program until then: of its start Python itself prints a traceback."""
+
 
 @dataclass
 class ProcessGroup:
@@ -43,6 +53,8 @@ class ProcessGroup:
         """Start one process; HannesError if its program cannot be run."""
         if name in self._children:
             raise HannesError(f"Two processes are called '{name}'; give each node its own name.")
+        waits = list(command[1:2]) == ["-c"] and command[2].startswith(QUIET_FROM_THE_START)
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT] if waits else [])
         try:
             self._children[name] = subprocess.Popen(
                 command,
@@ -52,6 +64,8 @@ class ProcessGroup:
             )
         except OSError as error:
             raise HannesError(f"Cannot start '{name}' ({command[0]}): {error.strerror}.") from error
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         self.say(f"[{name}] started, pid {self._children[name].pid}")
 
     @property

@@ -18,7 +18,7 @@ from hannes_description.errors import HannesError
 
 from .environment import ros_environment
 from .launch_file import LaunchPlan, read_launch_file
-from .processes import Interrupted, ProcessGroup, raise_on_signals
+from .processes import QUIET_FROM_THE_START, Interrupted, ProcessGroup, raise_on_signals
 
 
 def prefixes(environment: Mapping[str, str]) -> list[Path]:
@@ -47,11 +47,8 @@ def find_command(package: str, executable: str, environment: Mapping[str, str]) 
     for entry in _entry_points(package):
         if entry.name == executable:
             module, _, function = entry.value.partition(":")
-            # a signal that comes during the imports ends the node as quietly as a later one
             code = (
-                "import os, signal, sys\n"
-                "for number in (signal.SIGINT, signal.SIGTERM):\n"
-                "    signal.signal(number, lambda *_: os._exit(0))\n"
+                f"{QUIET_FROM_THE_START}"
                 f"sys.argv[0] = {executable!r}\n"
                 f"from {module} import {function}\n"
                 f"sys.exit({function}())"
