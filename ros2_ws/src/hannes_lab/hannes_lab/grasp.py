@@ -104,14 +104,14 @@ def with_seen_objects(trials: Sequence[Trial], model: Model) -> list[Trial]:
         if given and _error(trial, model) <= _error(_with_object(trial, grasp), model):
             out.append(trial)
             continue
-        said = (
+        what = (
             "its stiffness and place are"
             if given
             else "that something was grasped, its stiffness and place are"
         )
         note = (
-            f"{said} read from the closures (about {grasp.stiffness:.2g} N/m with the wire, from {place:.1f} rad on) "
-            f"and fitted; say --object {trial.name}=none if nothing was"
+            f"{what} read from the closures (about {grasp.stiffness:.2g} N/m with the wire, from {place:.1f} rad on) "
+            "and fitted" + ("" if given else f"; say --object {trial.name}=none if nothing was")
         )
         out.append(replace(_with_object(trial, grasp), notes=(*trial.notes, note)))
     return out

@@ -160,8 +160,10 @@ def without_outliers(trial: Trial) -> Trial:
             (dropped if far > OUTLIER and not needed else kept).append(closure)
     if not dropped:
         return trial
+    several = len(trial.conditions) > 1
     note = f"{len(dropped)} closure(s) far from the others are left out, starting at " + ", ".join(
-        f"{max(c.start, 0.0):.1f} s{_missing(trial, c)}" for c in dropped
+        f"{max(c.start, 0.0):.1f} s{f' ({c.condition})' if several else ''}{_missing(trial, c)}"
+        for c in dropped
     )
     return replace(trial, closures=tuple(sorted(kept, key=lambda c: c.start)), notes=(*trial.notes, note))
 
