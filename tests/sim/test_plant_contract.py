@@ -129,6 +129,34 @@ def test_effects_act_on_every_plant(model: Model) -> None:
         assert run.motor_current[closing].mean() > 1.1 * base.motor_current[closing].mean(), name
 
 
+@pytest.mark.parametrize("port", ["FRICTION", "DAMPING", "LOAD_FRICTION", "LOAD_DAMPING"])
+def test_an_effect_takes_no_more_friction_than_there_is(model: Model, port: str, tmp_path: Path) -> None:
+    file = tmp_path / "less.py"
+    file.write_text(
+        f"from hannes_sim.effect import Effect, EffectParameter\nfrom hannes_sim.ports import {port}\n\n\n"
+        "class Less(Effect):\n"
+        "    name = 'less'\n"
+        "    parameters = (EffectParameter('by', 'N.m', 0.0, 10.0, 0.1, 0.0, 'what is taken away'),)\n\n"
+        "    @staticmethod\n"
+        "    def contribute(x, p, s, y):\n"
+        f"        y[{port}] -= p[0]\n"
+    )
+    source = f"{file}:Less"
+    law, reference = DoublePID.of_model(model.parameters), half_sine(1, amplitude=10.0, period=2.0)[:700]
+    runs = [
+        rollout(
+            make_plant(model.with_effect(load_effect(source).entry({"by": by}, source=source))),
+            law,
+            reference,
+        )
+        for by in (0.0, 0.3, 3.0)
+    ]
+    none_left, more = runs[1:]
+    assert np.array_equal(none_left.encoder_position, more.encoder_position)
+    nothing_there = model.plant == "reduced" and port == "LOAD_DAMPING"  # hand.viscous is nominally 0
+    assert np.array_equal(runs[0].encoder_position, none_left.encoder_position) == nothing_there
+
+
 def test_friction_beyond_a_gap_is_the_same_in_both_plants() -> None:
     """Against the same gap without it: where and how much the current falls."""
     change = []

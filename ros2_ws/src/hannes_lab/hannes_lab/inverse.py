@@ -79,7 +79,8 @@ def force_residual(
     delay = float(outputs[:, DELAY].mean()) + 0.5 * dt
     measured = np.interp(grid - delay, grid, measured)
     inertia = plant.get("motor.armature") * plant.get("gear.ratio") ** 2 + outputs[:, INERTIA]
-    free = inertia * a + (plant.get("friction.viscous") + outputs[:, DAMPING]) * v
+    damping = np.maximum(plant.get("friction.viscous") + outputs[:, DAMPING], 0.0)
+    free = inertia * a + damping * v
     free -= outputs[:, TORQUE] + outputs[:, LOAD_TORQUE]
     level = np.maximum(plant.get("friction.coulomb") + outputs[:, FRICTION], 0.0)
     # At rest dry friction takes whatever is left, up to its level.

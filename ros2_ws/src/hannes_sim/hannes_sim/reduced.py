@@ -151,7 +151,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
                 force -= p[_STOP_K] * ql
             elif ql > p[_TRAVEL]:
                 force -= p[_STOP_K] * (ql - p[_TRAVEL])
-            inertia = p[_J_LOAD] + dt * (p[_LOAD_VISCOUS] + y[LOAD_DAMPING])
+            inertia = p[_J_LOAD] + dt * max(0.0, p[_LOAD_VISCOUS] + y[LOAD_DAMPING])
             momentum, friction = p[_J_LOAD] * vl + dt * force, p[_LOAD_COULOMB] + y[LOAD_FRICTION]
             vl = dry_friction(momentum, friction * dt, 1.0 / inertia)
             depth, contact = ql - p[_OBJECT_AT], 0.0
@@ -168,7 +168,7 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
             ql, vl, load = q, v, -y[LOAD_TORQUE]
 
         inertia = p[P_INERTIA] + y[INERTIA]
-        damped = inertia + dt * (p[_VISCOUS] + y[DAMPING])
+        damped = inertia + dt * max(0.0, p[_VISCOUS] + y[DAMPING])
         friction = p[_COULOMB] + y[FRICTION]
         v = dry_friction(inertia * v + dt * (torque - load), friction * dt, 1.0 / damped)
         q += dt * v
