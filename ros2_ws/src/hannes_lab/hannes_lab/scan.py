@@ -12,11 +12,10 @@ from hannes_description.model import Model
 from hannes_sim.effect import EffectParameter, EffectType
 from numpy.typing import NDArray
 
-from .features import Features
 from .fit import Fit, finite_differences, linear_minimum, prior_weights
 from .problem import Coordinate, Problem, effect_coordinates
 from .settle import seen_from
-from .spectrum import position_periods, whole_periods
+from .spectrum import position_periods, turn, whole_periods
 from .surrogate import AnchoredRig
 
 Array = NDArray[np.float64]
@@ -103,7 +102,7 @@ class Scan:
         best: list[Scored] = []
         all_pits = off and not isinstance(self.problem.rig, AnchoredRig)
         lines = spectral_periods(kind, seen_from(self.problem, base), base)
-        shapes = shapes_of(kind, (*lines, *tried_periods(kind, self.problem.features)))
+        shapes = shapes_of(kind, (*lines, *tried_periods(kind, self.problem, base)))
         period = period_of(kind)
         for place in places:
             scan = _Place(self, kind, place, model, coordinates)
@@ -293,16 +292,16 @@ def period_of(kind: EffectType) -> EffectParameter | None:
     return next((p for p in kind.parameters if p.period), None)
 
 
-def tried_periods(kind: EffectType, features: Features) -> tuple[float, ...]:
+def tried_periods(kind: EffectType, problem: Problem, base: Fit) -> tuple[float, ...]:
     """Periods of an effect's ripple that are tried whatever the residual looks like; none for other effects."""
     p = period_of(kind)
-    return whole_periods(features, p.lower, p.upper) if p else ()
+    return whole_periods(problem.features, p.lower, p.upper, turn(problem, base)) if p else ()
 
 
 def spectral_periods(kind: EffectType, problem: Problem, base: Fit) -> tuple[float, ...]:
     """Periods of an effect's ripple at which the residual has a line; none for other effects."""
     p = period_of(kind)
-    return position_periods(problem, base, p.lower, p.upper) if p else ()
+    return position_periods(problem, base, p.lower, p.upper) if p and not turn(problem, base) else ()
 
 
 def shapes_of(kind: EffectType, periods: Sequence[float] = ()) -> list[Point]:

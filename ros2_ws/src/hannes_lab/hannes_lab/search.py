@@ -776,7 +776,7 @@ class Search:
         strengths = [c for c, p in zip(own, kind.parameters, strict=True) if p.vanishing is not None]
         out = []
         # Every other period: those between are no further chances.
-        for shape in shapes_of(kind, tried_periods(kind, self.problem.features)[1::2]):
+        for shape in shapes_of(kind, tried_periods(kind, self.problem, base.fit)[1::2]):
             z = np.array([shape.get(c.name, c.z(here.get(c.name, c.offset))) for c in coordinates])
             values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
             r = self.problem.residual(model, values)

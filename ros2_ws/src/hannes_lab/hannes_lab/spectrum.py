@@ -7,12 +7,14 @@ of the mean residual of every condition and signal, added up; a line counts wher
 from __future__ import annotations
 
 import numpy as np
+from hannes_sim.ports import R_Q
 from numpy.typing import NDArray
 from scipy.special import gammainccinv, gammaincinv
 
 from .features import Features
 from .fit import Fit
 from .problem import Problem
+from .rig import PlantRig
 
 Array = NDArray[np.float64]
 
@@ -28,13 +30,45 @@ WAVES = tuple(0.5 * k for k in range(1, 81))
 with friction and a controller around it shows few of them as lines."""
 
 
-def whole_periods(features: Features, lower: float, upper: float) -> tuple[float, ...]:
-    """Periods between lower and upper [unit of the position] of which WAVES are within the travel, longest first."""
+JUMP = 0.3
+"""A position that is wrapped jumps by this part of its travel and more from one sample to the next."""
+
+FARTHER = 1.5
+"""... and the machine goes so many times as far as its position does."""
+
+
+def whole_periods(features: Features, lower: float, upper: float, turn: float = 0.0) -> tuple[float, ...]:
+    """Periods between lower and upper [unit of the position] of which WAVES are within the travel, longest first.
+
+    turn    by how much the position is wrapped: in that there are whole periods, and the way is so long that one which
+            is off by a percent is out of step
+    """
+    if turn > 0.0:
+        return tuple(turn / waves for waves in range(1, 81) if lower <= turn / waves <= upper)
     travel = [b.measured for b in features.blocks if b.signal == "encoder_position"]
     if not travel:
         return ()
     total = max(float(x.max()) for x in travel) - min(float(x.min()) for x in travel)
     return tuple(total / waves for waves in WAVES if lower <= total / waves <= upper)
+
+
+def turn(problem: Problem, fit: Fit) -> float:
+    """By how much a recorded position jumps back where it is wrapped [its unit]; 0 where none is.
+
+    Against the fitted machine, whose position goes on: what both have in common is no jump.
+    """
+    rig = problem.rig
+    for trial in problem.features.trials if isinstance(rig, PlantRig) else ():
+        time, x = trial.signals.get("encoder_position", (np.zeros(0), np.zeros(0)))
+        if x.size < 2 or np.abs(np.diff(x)).max() < JUMP * np.ptp(x):
+            continue
+        q = rig.run(fit.model, fit.values, trial, trial.reference).raw[:, R_Q]
+        at = np.clip(np.round(time / trial.period).astype(int), 0, q.size - 1)
+        jumps = np.abs(np.diff(q[at]) - np.diff(x))
+        jumps = jumps[jumps > JUMP * np.ptp(x)]
+        if jumps.size and np.ptp(q) > FARTHER * np.ptp(x):
+            return float(np.median(jumps / np.round(jumps / jumps.min())))
+    return 0.0
 
 
 def position_periods(
