@@ -12,6 +12,7 @@ from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.rig import load_rig, scaled_effect
 from hannes_lab.search import Search
 from hannes_lab.spectrum import turn, whole_periods
+from hannes_lab.wording import notes
 from hannes_sim.effect import load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.rollout import rollout
@@ -60,3 +61,22 @@ def test_a_ripple_of_whole_waves_in_a_turn_is_found(prepared: Prepared) -> None:
     amplitude = math.hypot(ripple["sine"].value, ripple["cosine"].value)
     assert amplitude == pytest.approx(math.hypot(0.06, 0.04), rel=0.05)
     assert found.values["motor.armature"] == pytest.approx(0.022, rel=0.03)
+
+
+def test_a_ripple_that_the_way_shows_once_is_said_to_be_that(prepared: Prepared) -> None:
+    """A motor with one wave in its whole way may have any curve over the position."""
+    sources = effect_sources(only=["cogging"])
+    search = Search(prepared.problem, prepared.model, prepared.nuisances, sources)
+    best = search.from_point(("cogging",), {"cogging.sine": 1.0})
+
+    def said(period: float) -> list[str]:
+        fit = best.fit
+        z = fit.z.copy()
+        (k,) = (k for k, c in enumerate(fit.coordinates) if c.name == "cogging.period")
+        z[k] = fit.coordinates[k].z(period)
+        found = notes(search, replace(best, fit=replace(fit, z=z)), "effects", (), (), False, None)
+        return [note for note in found if "of its waves" in note]
+
+    assert not said(PERIOD)
+    (note,) = said(TURN / 1.5)
+    assert note.startswith("cogging: the whole way is 1.") and "a longer way tells" in note

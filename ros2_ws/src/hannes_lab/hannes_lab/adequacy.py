@@ -134,6 +134,15 @@ def _travel(trial: Trial) -> float:
     return trial.span
 
 
+def waves_of(search: Search, candidate: Candidate, effect: str) -> float:
+    """How many periods of an effect of a set the machine passes on its way; infinite for one that has no period."""
+    period = period_of(search.effect(effect))
+    if period is None:
+        return math.inf
+    travel = max(_travel(trial) for trial in search.problem.features.trials)
+    return travel / candidate.fit.values[f"{effect}.{period.name}"]
+
+
 def distorted(search: Search, candidate: Candidate, among: Sequence[str] | None = None) -> str:
     """The effect of less than one wave, or of few whose shapes are farther off than DISTORTED, in words; or empty.
 
@@ -141,15 +150,12 @@ def distorted(search: Search, candidate: Candidate, among: Sequence[str] | None 
     """
     fit = candidate.fit
     for effect in candidate.names if among is None else among:
-        kind = search.effect(effect)
-        period = period_of(kind)
-        if period is None:
-            continue
+        waves = waves_of(search, candidate, effect)
         shapes = {
-            f"{effect}.{p.name}": fit.z_of(f"{effect}.{p.name}") or 0.0 for p in kind.parameters if p.sd
+            f"{effect}.{p.name}": fit.z_of(f"{effect}.{p.name}") or 0.0
+            for p in search.effect(effect).parameters
+            if p.sd
         }
-        travel = max(_travel(trial) for trial in search.problem.features.trials)
-        waves = travel / fit.values[f"{effect}.{period.name}"]
         if waves < 1.0 and (search.problem.rig.foreign or search.problem.discrepancy):
             return (
                 f"{effect}, of {waves:.1f} waves in all, would repeat nowhere: it stands for something else"

@@ -58,7 +58,9 @@ def turn(problem: Problem, fit: Fit) -> float:
     Against the fitted machine, whose position goes on: what both have in common is no jump.
     """
     rig = problem.rig
-    for trial in problem.features.trials if isinstance(rig, PlantRig) else ():
+    if not isinstance(rig, PlantRig):
+        return 0.0
+    for trial in problem.features.trials:
         time, x = trial.signals.get("encoder_position", (np.zeros(0), np.zeros(0)))
         if x.size < 2 or np.abs(np.diff(x)).max() < JUMP * np.ptp(x):
             continue

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .adequacy import disbelieved, shortfall
+from .adequacy import disbelieved, shortfall, waves_of
 from .chance import Chance
 from .choose import Choice, can_be_held_out, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
@@ -48,6 +48,9 @@ UNUSUAL = 1.5
 
 HELD = 0.01
 """Standard deviations of its prior from a bound within which a parameter is held by it."""
+
+SHOWN_WAVES = 2.0
+"""Waves within the way below which it is worth a note that a ripple has not been seen to repeat."""
 
 NAMED = 4
 """Effects that a sentence names; of more, it says how many."""
@@ -211,11 +214,22 @@ def notes(
         *((clock.said,) if clock else ()),
         *_inseparable(search, experiments),
         *_ends(search, best, effects),
+        *_few_waves(search, best),
         *_undescribed(best),
         *_taken_for_its_own(search, best),
         *_identifiability(best),
         *failure_notes(search.problem),
     )
+
+
+def _few_waves(search: Search, best: Candidate) -> list[str]:
+    """Of a ripple of which the way shows no second wave whole: that it repeats is assumed."""
+    return [
+        f"{name}: the whole way is {waves:.1f} of its waves, so that it repeats is not shown: whatever goes with the "
+        "position in about that form would look the same (a longer way tells)"
+        for name in best.names
+        if (waves := waves_of(search, best, name)) < SHOWN_WAVES
+    ]
 
 
 def unforetold(choice: Choice) -> tuple[str, ...]:
