@@ -19,7 +19,7 @@ from hannes_lab.compare import MetricRow
 from hannes_lab.diagnosis import Fall, Rank
 from hannes_lab.errors import SignalError
 from hannes_lab.falls import fall_sentence
-from hannes_lab.pictures import write_picture
+from hannes_lab.pictures import _heading, write_picture
 from hannes_lab.report import embedded_json, render_report, write_report
 from hannes_lab.report_next import next_step, runner_up
 from hannes_lab.report_text import (
@@ -34,6 +34,7 @@ from hannes_lab.report_text import (
     unit,
 )
 from hannes_lab.wording import unforetold
+from matplotlib.figure import Figure
 
 NAN = math.nan
 TIME = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
@@ -853,3 +854,12 @@ def test_intervals_share_a_power_of_ten() -> None:
     }
     assert interval(1.8, None, NAN, "s") == {"value": "1.800", "low": "–", "high": "–", "unit": "s"}
     assert interval(NAN, 0.0, 1.0, "s")["value"] == "–"
+
+
+def test_the_figures_of_the_heading_end_within_the_picture() -> None:
+    """Three errors in units of their own, of a recording without repeats, are long."""
+    figure = Figure(figsize=(14.0, 8.0))
+    long = {"was": "0.0871", "value": "0.0630 rad", "label": "error of encoder position on conditions " * 3}
+    _heading(figure, {"kind": "unknown", "label": "", "headline": "", "figures": [long] * 3}, "", 8.0)
+    assert any("0.0630" in text.get_text() for text in figure.texts)
+    assert max(text.get_window_extent().x1 for text in figure.texts) <= figure.bbox.x1

@@ -228,6 +228,10 @@ def _below(figure: Figure, panels: Sequence[Panel], height: float) -> None:
         x += p.labels + width + p.right
 
 
+ROOM = 0.965
+"""Part of the width that a line of the heading may take."""
+
+
 def _heading(figure: Figure, verdict: Mapping[str, Any], title: str, height: float) -> None:
     tone = TONES[verdict["kind"]]
     figure.text(
@@ -245,7 +249,10 @@ def _heading(figure: Figure, verdict: Mapping[str, Any], title: str, height: flo
     key = "      ".join(
         f"{f['was'] + ' → ' if f['was'] else ''}{f['value']}  {f['label']}" for f in verdict["figures"][:3]
     )
-    figure.text(0.018, 1.0 - 0.98 / height, _plain(key), color=SOFT, fontsize=8.5, va="center")
+    line = figure.text(0.018, 1.0 - 0.98 / height, _plain(key), color=SOFT, fontsize=8.5, va="center")
+    wide = line.get_window_extent().width / figure.bbox.width
+    if wide > ROOM:
+        line.set_fontsize(8.5 * ROOM / wide)
     figure.add_artist(_stripe(tone))
 
 
