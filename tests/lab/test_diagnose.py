@@ -423,14 +423,13 @@ def test_an_effect_outside_the_catalogue_is_called_unknown(latched: Prepared, ex
     assert {d.variable for d in found.depends_on} == variables
 
 
-def test_triples_are_not_tried_where_the_pairs_lead_nowhere(latched: Prepared, executor: Executor) -> None:
+def test_triples_are_not_tried_where_the_pairs_lead_nowhere(latched: Prepared) -> None:
     only = ["gravity", "glove_stiffness", "encoder_offset", "return_preload"]
     texts = set[str]()
     found = diagnose(
         latched,
         effect_sources(only=only),
         progress=lambda done, total, text: texts.add(text),
-        executor=executor,
     )
     assert found.verdict == "unknown"
     assert any("sets of more effects were not tried" in note for note in found.notes)

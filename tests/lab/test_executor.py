@@ -37,7 +37,11 @@ ONLY = ["glove_stiffness", "wire_slack", "gravity"]
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("set")
     made, truth = make_set(
-        Model.load(), [strength_of("glove_stiffness", 1.0)], seed=401, closures=4, conditions=("fast",)
+        Model.load(),
+        [strength_of("glove_stiffness", 1.0)],
+        seed=401,
+        closures=5,
+        conditions=("fast", "grasp_fast"),
     )
     write_set(made, truth, folder / "bags", folder / "truth.yaml")
     return folder / "bags"
@@ -143,6 +147,7 @@ def test_a_result_cannot_depend_on_effects_that_it_does_not_name(prepared: Prepa
 
 
 def sees(search: Search, *_: Any) -> list[str]:
+    assert not (search.found or search._scans or search.before), "what was found elsewhere"
     return sorted(search.sources)
 
 

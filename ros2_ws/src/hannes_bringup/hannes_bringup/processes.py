@@ -54,8 +54,9 @@ class ProcessGroup:
         if name in self._children:
             raise HannesError(f"Two processes are called '{name}'; give each node its own name.")
         waits = list(command[1:2]) == ["-c"] and command[2].startswith(QUIET_FROM_THE_START)
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT] if waits else [])
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, [])
         try:
+            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT] if waits else [])
             self._children[name] = subprocess.Popen(
                 command,
                 env=None if self.environment is None else dict(self.environment),

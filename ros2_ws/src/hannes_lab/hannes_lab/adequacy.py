@@ -10,6 +10,7 @@ import numpy as np
 from .chance import Chance
 from .scan import period_of
 from .search import FAR, PULLED, Candidate, Search
+from .spectrum import turn
 from .trials import Trial
 
 ADEQUATE = 1.25
@@ -139,7 +140,9 @@ def waves_of(search: Search, candidate: Candidate, effect: str) -> float:
     period = period_of(search.effect(effect))
     if period is None:
         return math.inf
-    travel = max(_travel(trial) for trial in search.problem.features.trials)
+    trials, wrapped = search.problem.features.trials, turn(search.problem, candidate.fit)
+    ways = [np.ptp(np.unwrap(trial.reference, period=wrapped)) for trial in trials] if wrapped else []
+    travel = float(max(ways, default=0.0)) or max(_travel(trial) for trial in trials)
     return travel / candidate.fit.values[f"{effect}.{period.name}"]
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .fit import Fit, finite_differences, linear_minimum, prior_weights
 from .problem import Coordinate, Problem, effect_coordinates
 from .settle import seen_from
-from .spectrum import position_periods, turn, whole_periods
+from .spectrum import periods_of_a_turn, position_periods, whole_periods
 from .surrogate import AnchoredRig
 
 Array = NDArray[np.float64]
@@ -292,16 +292,22 @@ def period_of(kind: EffectType) -> EffectParameter | None:
     return next((p for p in kind.parameters if p.period), None)
 
 
-def tried_periods(kind: EffectType, problem: Problem, base: Fit) -> tuple[float, ...]:
-    """Periods of an effect's ripple that are tried whatever the residual looks like; none for other effects."""
+def tried_periods(kind: EffectType, problem: Problem, base: Fit, every: int = 1) -> tuple[float, ...]:
+    """Periods of an effect's ripple that are tried whatever the residual looks like; none for other effects.
+
+    every   of how many neighbours within the travel one is taken
+    """
     p = period_of(kind)
-    return whole_periods(problem.features, p.lower, p.upper, turn(problem, base)) if p else ()
+    if p is None:
+        return ()
+    along = whole_periods(problem.features, p.lower, p.upper)[every - 1 :: every]
+    return (*along, *periods_of_a_turn(problem, base, p.lower, p.upper))
 
 
 def spectral_periods(kind: EffectType, problem: Problem, base: Fit) -> tuple[float, ...]:
     """Periods of an effect's ripple at which the residual has a line; none for other effects."""
     p = period_of(kind)
-    return position_periods(problem, base, p.lower, p.upper) if p and not turn(problem, base) else ()
+    return position_periods(problem, base, p.lower, p.upper) if p else ()
 
 
 def shapes_of(kind: EffectType, periods: Sequence[float] = ()) -> list[Point]:

@@ -737,8 +737,8 @@ class Search:
         return {name: self.sources[name] for name in sorted(names & self.sources.keys())}
 
     def _knowing(self, item: tuple[Any, ...]) -> Search:
-        """This search for one item: it knows the effects that the item's key is made of, and no others."""
-        return replace(self, sources=self._sources_of(item))
+        """This search for one item: it knows the effects that the item's key holds, and nothing that was found."""
+        return replace(self, sources=self._sources_of(item), found={}, before=None, _scans={})
 
     @property
     def _codec(self) -> Codec:
@@ -776,7 +776,7 @@ class Search:
         strengths = [c for c, p in zip(own, kind.parameters, strict=True) if p.vanishing is not None]
         out = []
         # Every other period: those between are no further chances.
-        for shape in shapes_of(kind, tried_periods(kind, self.problem, base.fit)[1::2]):
+        for shape in shapes_of(kind, tried_periods(kind, self.problem, base.fit, 2)):
             z = np.array([shape.get(c.name, c.z(here.get(c.name, c.offset))) for c in coordinates])
             values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
             r = self.problem.residual(model, values)

@@ -7,6 +7,7 @@ of the mean residual of every condition and signal, added up; a line counts wher
 from __future__ import annotations
 
 import numpy as np
+from hannes_sim.plant import PlantDiverged
 from hannes_sim.ports import R_Q
 from numpy.typing import NDArray
 from scipy.special import gammainccinv, gammaincinv
@@ -31,20 +32,17 @@ with friction and a controller around it shows few of them as lines."""
 
 
 JUMP = 0.3
-"""A position that is wrapped jumps by this part of its travel and more from one sample to the next."""
+"""A reference that is wrapped jumps by this part of its travel and more within a tick, ..."""
+
+ALIKE = 0.02
+"""... each time by whole turns, as nearly as this part of one, ..."""
 
 FARTHER = 1.5
-"""... and the machine goes so many times as far as its position does."""
+"""... and the machine goes so many times as far as its reference does."""
 
 
-def whole_periods(features: Features, lower: float, upper: float, turn: float = 0.0) -> tuple[float, ...]:
-    """Periods between lower and upper [unit of the position] of which WAVES are within the travel, longest first.
-
-    turn    by how much the position is wrapped: in that there are whole periods, and the way is so long that one which
-            is off by a percent is out of step
-    """
-    if turn > 0.0:
-        return tuple(turn / waves for waves in range(1, 81) if lower <= turn / waves <= upper)
+def whole_periods(features: Features, lower: float, upper: float) -> tuple[float, ...]:
+    """Periods between lower and upper [unit of the position] of which WAVES are within the travel, longest first."""
     travel = [b.measured for b in features.blocks if b.signal == "encoder_position"]
     if not travel:
         return ()
@@ -52,25 +50,46 @@ def whole_periods(features: Features, lower: float, upper: float, turn: float = 
     return tuple(total / waves for waves in WAVES if lower <= total / waves <= upper)
 
 
-def turn(problem: Problem, fit: Fit) -> float:
-    """By how much a recorded position jumps back where it is wrapped [its unit]; 0 where none is.
+def periods_of_a_turn(problem: Problem, fit: Fit, lower: float, upper: float) -> tuple[float, ...]:
+    """Periods between lower and upper [unit of the position] of which whole ones are in a turn, if it turns on.
 
-    Against the fitted machine, whose position goes on: what both have in common is no jump.
+    Its way is so long that a period which is off by a percent is out of step; others than these would not repeat.
+    """
+    whole = turn(problem, fit)
+    return tuple(whole / waves for waves in range(1, 81) if lower <= whole / waves <= upper)
+
+
+def turn(problem: Problem, fit: Fit) -> float:
+    """By how much the reference of a machine that turns on is wrapped [unit of the position]; 0 where none is.
+
+    The reference is known tick by tick, so its jumps tell it exactly; the machine goes on where they are no steps.
     """
     rig = problem.rig
-    if not isinstance(rig, PlantRig):
-        return 0.0
-    for trial in problem.features.trials:
-        time, x = trial.signals.get("encoder_position", (np.zeros(0), np.zeros(0)))
-        if x.size < 2 or np.abs(np.diff(x)).max() < JUMP * np.ptp(x):
+    for trial in problem.features.trials if isinstance(rig, PlantRig) else ():
+        wrapped = _jumps(trial.reference)
+        if not wrapped or trial.anew:
             continue
-        q = rig.run(fit.model, fit.values, trial, trial.reference).raw[:, R_Q]
-        at = np.clip(np.round(time / trial.period).astype(int), 0, q.size - 1)
-        jumps = np.abs(np.diff(q[at]) - np.diff(x))
-        jumps = jumps[jumps > JUMP * np.ptp(x)]
-        if jumps.size and np.ptp(q) > FARTHER * np.ptp(x):
-            return float(np.median(jumps / np.round(jumps / jumps.min())))
+        try:
+            way = rig.run(fit.model, fit.values, trial, trial.reference).raw[:, R_Q]  # type: ignore[attr-defined]
+        except PlantDiverged:
+            continue
+        if np.ptp(way) > FARTHER * np.ptp(trial.reference):
+            return wrapped
     return 0.0
+
+
+def _jumps(reference: Array) -> float:
+    """Of which size all jumps of a reference (n,) are, or whole multiples; 0 if it has less than two, or others."""
+    steps, span = np.diff(reference), float(np.ptp(reference))
+    at = np.flatnonzero(np.abs(steps) > JUMP * span)
+    at = at[at > 0]
+    if span <= 0.0 or at.size < 2:
+        return 0.0
+    # without the way of that tick, which is about that of the tick before
+    jumps = np.abs(steps[at] - np.where(np.isin(at - 1, at), 0.0, steps[at - 1]))
+    unit = float(jumps.min())
+    times = np.round(jumps / unit)
+    return float(np.median(jumps / times)) if np.all(np.abs(jumps - times * unit) < ALIKE * unit) else 0.0
 
 
 def position_periods(

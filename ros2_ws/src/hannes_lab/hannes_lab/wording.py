@@ -225,7 +225,7 @@ def notes(
 def _few_waves(search: Search, best: Candidate) -> list[str]:
     """Of a ripple of which the way shows no second wave whole: that it repeats is assumed."""
     return [
-        f"{name}: the whole way is {waves:.1f} of its waves, so that it repeats is not shown: whatever goes with the "
+        f"{name}: the whole way is {waves:.3g} of its waves, so that it repeats is not shown: whatever goes with the "
         "position in about that form would look the same (a longer way tells)"
         for name in best.names
         if (waves := waves_of(search, best, name)) < SHOWN_WAVES

@@ -151,7 +151,8 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
                 force -= p[_STOP_K] * ql
             elif ql > p[_TRAVEL]:
                 force -= p[_STOP_K] * (ql - p[_TRAVEL])
-            inertia = p[_J_LOAD] + dt * max(0.0, p[_LOAD_VISCOUS] + y[LOAD_DAMPING])
+            damping = p[_LOAD_VISCOUS] + y[LOAD_DAMPING]
+            inertia = p[_J_LOAD] + dt * (0.0 if damping < 0.0 else damping)  # max(0, NaN) would be 0
             momentum, friction = p[_J_LOAD] * vl + dt * force, p[_LOAD_COULOMB] + y[LOAD_FRICTION]
             vl = dry_friction(momentum, friction * dt, 1.0 / inertia)
             depth, contact = ql - p[_OBJECT_AT], 0.0
@@ -168,7 +169,8 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
             ql, vl, load = q, v, -y[LOAD_TORQUE]
 
         inertia = p[P_INERTIA] + y[INERTIA]
-        damped = inertia + dt * max(0.0, p[_VISCOUS] + y[DAMPING])
+        damping = p[_VISCOUS] + y[DAMPING]
+        damped = inertia + dt * (0.0 if damping < 0.0 else damping)
         friction = p[_COULOMB] + y[FRICTION]
         v = dry_friction(inertia * v + dt * (torque - load), friction * dt, 1.0 / damped)
         q += dt * v
