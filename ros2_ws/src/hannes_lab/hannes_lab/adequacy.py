@@ -140,9 +140,11 @@ def waves_of(search: Search, candidate: Candidate, effect: str) -> float:
     period = period_of(search.effect(effect))
     if period is None:
         return math.inf
-    trials, wrapped = search.problem.features.trials, turn(search.problem, candidate.fit)
-    ways = [np.ptp(np.unwrap(trial.reference, period=wrapped)) for trial in trials] if wrapped else []
-    travel = float(max(ways, default=0.0)) or max(_travel(trial) for trial in trials)
+    wrapped = turn(search.problem, candidate.fit)
+    travel = max(
+        float(np.ptp(np.unwrap(trial.reference, period=wrapped))) if wrapped else _travel(trial)
+        for trial in search.problem.features.trials
+    )
     return travel / candidate.fit.values[f"{effect}.{period.name}"]
 
 

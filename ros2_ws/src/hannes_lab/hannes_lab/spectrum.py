@@ -31,6 +31,9 @@ WAVES = tuple(0.5 * k for k in range(1, 81))
 with friction and a controller around it shows few of them as lines."""
 
 
+TURN_WAVES = range(1, 81)
+"""Waves within a turn whose ripple is simulated: whole ones, for else turns would not repeat."""
+
 JUMP = 0.3
 """A reference that is wrapped jumps by this part of its travel and more within a tick, ..."""
 
@@ -56,7 +59,7 @@ def periods_of_a_turn(problem: Problem, fit: Fit, lower: float, upper: float) ->
     Its way is so long that a period which is off by a percent is out of step; others than these would not repeat.
     """
     whole = turn(problem, fit)
-    return tuple(whole / waves for waves in range(1, 81) if lower <= whole / waves <= upper)
+    return tuple(whole / waves for waves in TURN_WAVES if lower <= whole / waves <= upper)
 
 
 def turn(problem: Problem, fit: Fit) -> float:
@@ -65,12 +68,14 @@ def turn(problem: Problem, fit: Fit) -> float:
     The reference is known tick by tick, so its jumps tell it exactly; the machine goes on where they are no steps.
     """
     rig = problem.rig
-    for trial in problem.features.trials if isinstance(rig, PlantRig) else ():
+    if not isinstance(rig, PlantRig):
+        return 0.0
+    for trial in problem.features.trials:
         wrapped = _jumps(trial.reference)
         if not wrapped or trial.anew:
             continue
         try:
-            way = rig.run(fit.model, fit.values, trial, trial.reference).raw[:, R_Q]  # type: ignore[attr-defined]
+            way = rig.run(fit.model, fit.values, trial, trial.reference).raw[:, R_Q]
         except PlantDiverged:
             continue
         if np.ptp(way) > FARTHER * np.ptp(trial.reference):
