@@ -126,7 +126,8 @@ def test_tables_are_current() -> None:
 
 
 def test_effects_page_has_every_effect_with_its_picture() -> None:
-    from hannes_lab.effects_page import describe
+    from hannes_lab.effects_page import describe, ports_section
+    from hannes_sim import ports
     from hannes_sim.effect import catalogue
 
     page = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
@@ -136,6 +137,9 @@ def test_effects_page_has_every_effect_with_its_picture() -> None:
         for p in describe(effect)["parameters"]:
             row = f"| `{p['name']}` | {p['unit']} | {p['lower']:g} .. {p['upper']:g} | {p['typical']:g} |"
             assert row in page, f"{name}.{p['name']}: run `hannes model effects --page docs/effects.md`"
+    told = ports_section()
+    assert told.count("| `x[") == ports.N_INPUTS and told.count("| `y[") == ports.N_OUTPUTS
+    assert page.endswith(told), "run `hannes model effects --page docs/effects.md`"
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -144,6 +144,7 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
     if out.exists():
         raise HannesError(f"{out} exists already; a bag is never overwritten. Choose another name.")
     salvage = _Salvage()
+    _gather_metadata(files, salvage)
     information: Mapping[str, Any] = {}
     if path.is_dir() and (path / METADATA_FILE).exists():
         try:
@@ -152,7 +153,6 @@ def recover(path: str | Path, out: str | Path) -> Recovery:
         except HannesError as error:
             salvage.damage.append(str(error).split(" Run `")[0])
     salvage.damage.extend(f"{name} is missing." for name in _missing(information, path))
-    _gather_metadata(files, salvage)
     writer: BagWriter | None = None
     counts: dict[str, int] = {}
     first, last, gap = 2**63, -1, (0, 0)

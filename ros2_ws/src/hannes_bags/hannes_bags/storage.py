@@ -257,7 +257,10 @@ def load_metadata(path: Path) -> dict[str, Any]:
 
 
 def decode_entries(entries: object) -> dict[str, Any]:
-    """custom_data or an MCAP metadata record as values: JSON where it is JSON, text otherwise."""
+    """custom_data or an MCAP metadata record as values: JSON where it is JSON, text otherwise.
+
+    None, as JSON's null, stands for what is not said any more, though another place of the bag still says it.
+    """
     if not isinstance(entries, Mapping):
         return {}
     values: dict[str, Any] = {}
@@ -312,6 +315,8 @@ class BagMessages:
                 self.counts[topic] = self.counts.get(topic, 0) + 1
                 yield topic, log_ns, data if unpack is None else unpack(path, data)
         self.metadata.update(decode_entries(self.bag.yaml.get("custom_data")))
+        for key in [key for key, value in self.metadata.items() if value is None]:
+            del self.metadata[key]
 
     def entries(self) -> tuple[TopicEntry, ...]:
         """The topics met so far, by name."""

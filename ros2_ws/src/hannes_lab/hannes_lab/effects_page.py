@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_sim import ports
 from hannes_sim.effect import EffectType, catalogue, effect_source, load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.objects import named_object
@@ -247,6 +249,35 @@ Written by `hannes model effects --page docs/effects.md`.
 """
 
 
+PORTS = """\
+## Inputs and outputs of an effect
+
+What `contribute(x, p, s, y)` reads in `x` and adds to in `y`, by the names of `hannes_sim.ports`. Angles, speeds,
+currents and torques are positive where they close the hand (of another machine: where the reference grows). A torque
+in `y` acts on the machine; a friction, a damping, an inertia, a slack or a compliance is positive where there is more
+of it. All outputs are zero before each step, and those of several effects add up.
+
+"""
+
+
+def ports_section() -> str:
+    """Inputs and outputs of an effect with their units in Markdown, from the file that declares them."""
+    text = inspect.getsource(ports)
+    tables = []
+    for letter, what, begin, end in (
+        ("x", "input", "# Inputs of an effect", "N_INPUTS"),
+        ("y", "output", "# Outputs of an effect", "N_OUTPUTS"),
+    ):
+        rows = re.findall(
+            r"^([A-Z_]+) = \d+  # ([^,]+), (.+)$", text.split(begin)[1].split(end)[0], re.MULTILINE
+        )
+        lines = [f"| {what} | unit | |", "|---|---|---|"]
+        tables.append(
+            "\n".join([*lines, *(f"| `{letter}[{n}]` | {unit} | {words} |" for n, unit, words in rows)])
+        )
+    return PORTS + "\n\n".join(tables) + "\n"
+
+
 def write_page(page: str | Path, names: Sequence[str], *, progress: Any = None) -> Path:
     """Write the page and, in figures/effects/ beside it, one .svg per effect."""
     page = Path(page)
@@ -263,7 +294,9 @@ def write_page(page: str | Path, names: Sequence[str], *, progress: Any = None) 
         if progress:
             progress(k + 1, len(names), effect.name)
     try:
-        page.write_text(HEAD + "\n".join(rows) + "\n\n" + "\n".join(sections), encoding="utf-8")
+        page.write_text(
+            HEAD + "\n".join(rows) + "\n\n" + "\n".join([*sections, ports_section()]), encoding="utf-8"
+        )
     except OSError as error:
         raise HannesError(f"The page cannot be written to '{page}': {error.strerror or error}.") from error
     return page

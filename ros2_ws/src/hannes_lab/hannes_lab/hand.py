@@ -12,17 +12,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from hannes_control.double_pid import DoublePID, DoublePIDParameters
-from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.parameters import data_path, read_yaml
 from hannes_sim.factory import is_plant, make_plant
-from hannes_sim.measurement import Sensors, folded_mean, goes_below_nought, logger, sample_noise
-from hannes_sim.objects import GraspObject, named_object
+from hannes_sim.measurement import folded_mean, goes_below_nought, logger, sample_noise
+from hannes_sim.objects import GraspObject
 from hannes_sim.plant import Plant
 from hannes_sim.rollout import Rollout, step_of
 from numpy.typing import NDArray
 
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD, later, moved, moving_mean
+from .described import grasp_of, loggers_of
 from .features import FINEST, Block
 from .rig import Nuisance, PlantRig, make_controller
 from .trials import SAME, Trial
@@ -136,24 +136,13 @@ _SMOOTHED = 0.03
 
 
 def object_of(trial: Trial) -> GraspObject | None:
-    """What a trial's metadata says was grasped: a name, a mapping, or nothing."""
-    given = trial.options.get("object")
-    if given is None or given == "none":
-        return None
-    if isinstance(given, str):
-        return named_object(given)
-    if isinstance(given, Mapping):
-        return GraspObject.from_dict(given)
-    raise HannesError(
-        f"Trial '{trial.name}': 'object' must be a name or a mapping, not {type(given).__name__}."
-    )
+    """What a trial's metadata says was grasped."""
+    return grasp_of(trial.options, f"Trial '{trial.name}'")
 
 
 def sensors_of(trial: Trial) -> dict[str, Any]:
     """How the current was logged: from the metadata, else guessed from the data (rectified if never below nought)."""
-    given = trial.options.get("sensors")
-    if isinstance(given, Mapping):
-        sensors = Sensors.from_dict(given)
+    if (sensors := loggers_of(trial.options, f"Trial '{trial.name}'")) is not None:
         return {
             "rectified": sensors.current_rectified,
             "window": sensors.current_window,
@@ -171,7 +160,7 @@ def sensors_of(trial: Trial) -> dict[str, Any]:
 
 def tells_logging(trial: Trial) -> bool:
     """True where the recording says how it was logged."""
-    return isinstance(trial.options.get("sensors"), Mapping)
+    return trial.options.get("sensors") is not None
 
 
 def is_described(trial: Trial) -> bool:

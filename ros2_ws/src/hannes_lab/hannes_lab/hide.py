@@ -27,8 +27,9 @@ from hannes_sim.objects import named_object
 from hannes_sim.rollout import Rollout, rollout
 from numpy.typing import NDArray
 
+from .described import CONTROL_PERIOD
 from .hand import make_controller
-from .trials import CONTROL_PERIOD, Closure, Trial
+from .trials import Closure, Trial
 
 Array = NDArray[np.float64]
 

@@ -62,7 +62,7 @@ def join_repeats(loaded: Sequence[Loaded], alike: float = ALIKE) -> list[Trial]:
     """The trials in their order, those that repeat the condition of an earlier one joined to it.
 
     Recordings are joined where each has fewer than ENOUGH closures, all of one condition, and they have the same kind,
-    signals, units and description (object, logger, pose), the same reference, and mean closures that are `alike`.  What
+    signals, units and description (object, logger), the same reference, and mean closures that are `alike`.  What
     is joined already stays as it is.  Whether each begins anew is said by the trials (`fresh`), or seen.
     """
     groups: list[list[Loaded]] = []

@@ -19,6 +19,7 @@ from hannes_bags.recording import Recording
 from hannes_description.errors import HannesError
 from numpy.typing import NDArray
 
+from .described import STRANGE_HOLD_RATE, ZERO_ORDER_HOLD_RATE, control_period, hold_rate
 from .units import in_si
 
 Array = NDArray[np.float64]
@@ -35,15 +36,6 @@ UNITS = {
     "motor_effort": "N.m",
 }
 """Units of the signals; a trial may name others."""
-
-ZERO_ORDER_HOLD_RATE = 90.0
-STRANGE_HOLD_RATE = 225.0
-"""Hz; a reference logged at least this fast is what the controller received, message by message; a slower log has gaps
-that are filled by a smooth curve.  The second is for recordings that do not say how they were logged."""
-
-CONTROL_PERIOD = 1e-3
-CONTROL_PERIODS = (1e-4, 1e-1)
-"""s; that of a controller of which a recording says nothing, and the shortest and longest that may be said."""
 
 _NEGATIVE = 0.005
 """Part of the samples below nought, beyond noise, that a rectified current does not have."""
@@ -137,7 +129,7 @@ class Trial:
 
     reference  (n,) on the control grid: reference[k] acts from k x period on
     signals    name -> (time (m,) s, values (m,))
-    options    what the plant must know of this recording (object, sensors, pose); the rig's adapter reads it
+    options    what the plant must know of this recording (object, sensors, plant); the rig's adapter reads it
     units      units of signals whose unit is not that of UNITS
     parts      the recordings that it is joined of; empty if it is one
     fresh      each part, or the recording beside others that it is joined to, begins as the first does, whatever came
@@ -573,36 +565,11 @@ def compared(recording: Recording, signals: Sequence[str] = SIGNALS) -> Recordin
     return replace(recording, channels={s: recording[s] for s in ("reference_position", *present)})
 
 
-def control_period(recording: Recording) -> float:
-    """Control period [s] that the recording's metadata say, or the usual one."""
-    given = recording.metadata.get("control_period", CONTROL_PERIOD)
-    low, high = CONTROL_PERIODS
-    if isinstance(given, bool) or not isinstance(given, int | float) or not low <= given <= high:
-        raise HannesError(
-            f"{recording.source}: its `control_period` is {given!r}; it must be the period of the control loop in "
-            f"seconds, {low:g} to {high:g}."
-        )
-    return float(given)
-
-
-def _hold_rate(recording: Recording) -> float:
-    """Hz from which on the reference is held from message to message: what the metadata say, or the usual one."""
-    held = recording.metadata.get("reference_held")
-    if held is None:
-        return ZERO_ORDER_HOLD_RATE if "sensors" in recording.metadata else STRANGE_HOLD_RATE
-    if not isinstance(held, bool):
-        raise HannesError(
-            f"{recording.source}: its `reference_held` is {held!r}; it must be true (the controller holds each message "
-            "until the next) or false (what was logged is a part of what it reads: filled by a smooth curve)."
-        )
-    return 0.0 if held else math.inf
-
-
 def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     """The trial of a recording in SI with nothing but what is compared."""
     notes = list(recording.warnings)
     meta = recording.metadata
-    period = control_period(recording)
+    period = control_period(meta, recording.source)
     name = name or str(meta.get("condition") or stem_of(recording.source))
     channel = recording["reference_position"]
     _check_overlap(recording)
@@ -614,7 +581,10 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
         for s, c in recording.channels.items()
     }
     logged = samples.pop("reference_position")
-    reference, note = reference_on_grid(*logged, period, duration, _hold_rate(recording))
+    reference, note = reference_on_grid(*logged, period, duration, hold_rate(meta, recording.source))
+    if note and "reference_held" not in meta:
+        other = "false" if "held" in note else "true"
+        note += f" (if that is wrong: `hannes describe BAG --say reference_held={other}`)"
     if note:
         notes.append(note)
     begin = max(float(t[0]) for t, _ in samples.values())
@@ -648,7 +618,7 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
             f"the references of its closures differ, so they are {len(kinds)} conditions: {told}; a closure that was "
             "broken off is one of its own; --object NAME=soft says what was grasped in one of them"
         )
-    options = {key: meta[key] for key in ("object", "sensors", "plant", "pose") if key in meta}
+    options = {key: meta[key] for key in ("object", "sensors", "plant") if key in meta}
     if "sensors" in options and "motor_current" in samples:
         options["sensors"], said = _as_it_is(options["sensors"], samples["motor_current"][1])
         notes += said
@@ -675,7 +645,7 @@ def _as_it_is(sensors: Any, current: Array) -> tuple[Any, list[str]]:
         return sensors, []
     return {**sensors, "current_rectified": False}, [
         f"motor_current goes to {current.min():.3g} A, though the recording's `sensors` say that it is rectified: "
-        'taken as signed; write "current_rectified": false'
+        'taken as signed; write "current_rectified": false there (`hannes describe`)'
     ]
 
 

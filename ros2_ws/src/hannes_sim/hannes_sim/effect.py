@@ -420,4 +420,7 @@ def strength_of(effect: str, factor: float) -> EffectEntry:
     for p in kind.parameters:
         scale = factor if p.vanishing is not None else 1.0
         values[p.name] = min(max(p.typical * scale, p.lower), p.upper)
-    return kind.entry(values, source=effect_source(effect))
+    where = (
+        "typical value of the effect" if factor == 1.0 else f"{factor:g} times the effect's typical strength"
+    )
+    return kind.entry(values, source=effect_source(effect), where=where)

@@ -64,9 +64,14 @@ class GraspObject:
                 f"Object: unknown keys {unknown}; valid are {', '.join(cls.__dataclass_fields__)}."
             )
         values = dict(content)
-        if "place" in values:
-            values["place"] = tuple(float(c) for c in values["place"])
-        return cls(**values)
+        try:
+            if "place" in values:
+                values["place"] = tuple(float(c) for c in values["place"])
+            return cls(**values)
+        except (TypeError, ValueError):
+            raise HannesError(
+                f"Object: {values} is not understood; shape is a word, place three numbers in m, all else a number."
+            ) from None
 
 
 SOFT_BALL = GraspObject(

@@ -52,6 +52,9 @@ COMMANDS: tuple[Command, ...] = (
     Command("play", "hannes_bringup.cli.bags:play", "Play a bag back onto the topics, with /clock."),
     Command("info", "hannes_bags.cli:info", "Show what a bag holds, and that it is intact."),
     Command("recover", "hannes_bringup.cli.bags:recover", "Save what is left of a cut or damaged bag."),
+    Command(
+        "describe", "hannes_lab.cli_describe:describe", "Write into bags what they may say of themselves."
+    ),
     Command("trials", "hannes_lab.cli_trials:trials", "Tell what the lab reads of recordings."),
     Command(
         "compare", "hannes_lab.cli:compare", "Compare the model with recorded closures: where does it fail?"
