@@ -131,6 +131,18 @@ def test_what_brakes_at_a_place_both_ways_is_told_though_its_mean_there_is_nothi
     assert pointed_at([replace(curve, at=curve.centres[0])]) == "", "there it turns"
 
 
+@pytest.mark.parametrize(("slope", "words"), [(0.3, "the more the larger"), (-0.3, "the less the larger")])
+def test_what_brakes_the_more_the_farther_it_is_is_told_as_that(slope: float, words: str) -> None:
+    """A wire that climbs its drum: the curve is farthest from its mean where it turns, and acts all the way."""
+    there = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 300))
+    position = np.concatenate([there, there[::-1]])
+    velocity = np.gradient(position)
+    climbs = np.sign(velocity) * slope * (position - 0.5)
+    states = {"position": [position[None]], "velocity": [velocity[None]], "direction": [velocity[None]]}
+    found = _dependences({"motor_current": [climbs[None]]}, states, "motor_current", [0.01])
+    assert words in pointed_at(found) and "along the way" in pointed_at(found)
+
+
 def test_what_swings_at_one_frequency_whatever_the_speed_is_told_from_a_ripple_along_the_way() -> None:
     rng = np.random.default_rng(4)
     steps, sizes = (0.01, 0.02, 0.04), (150, 150, 140)

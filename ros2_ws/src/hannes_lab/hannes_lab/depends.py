@@ -55,6 +55,9 @@ WORTH_SAYING = {FREQUENCY: 0.2, BRAKING: 0.2, "position": 0.4, INERTIA: 0.35}
 SHOWN = 0.2
 """Share of a place from which it is told that less of it is alike in all passes."""
 
+TREND = 0.85
+"""Correlation of a curve with the place from which it is told as what grows or falls along the whole way."""
+
 ABOVE = 2.0
 """Times that a mean residual's square must exceed what the closures' scatter makes of it, to show a frequency."""
 AT_REST = 1e-3
@@ -177,6 +180,13 @@ def pointed_at(found: Sequence[Dependence]) -> str:
                 f"{what} goes with the acceleration by where it is: an inertia that depends on the position (a "
                 "crank, a linkage); examples/effects/position_inertia.py is an effect for it"
             )
+        if first.variable == BRAKING and abs(trend := _trend(first)) >= TREND:
+            more, grows = ("more", "grows") if trend > 0.0 else ("less", "falls")
+            return (
+                f"{what} acts against the motion, either way, the {more} the larger the position is: friction that "
+                f"{grows} along the way (a wire that climbs its drum, a guide that tightens, a seal); an effect that "
+                "adds to y[FRICTION] by x[Q] all the way, as examples/effects/local_friction.py does at one place"
+            )
         if first.at in (first.centres[0], first.centres[-1]):
             continue
         if first.variable == "position":
@@ -190,6 +200,14 @@ def pointed_at(found: Sequence[Dependence]) -> str:
             "is lubricated there; examples/effects/local_friction.py is an effect for it"
         )
     return ""
+
+
+def _trend(found: Dependence) -> float:
+    """Correlation of the curve with the place, but for its ends, where the machine turns; 0 of too few places."""
+    places, curve = np.array(found.centres[1:-1]), np.array(found.curve[1:-1])
+    if places.size < BINS or np.ptp(curve) <= ROUNDING * np.abs(curve).max() or np.ptp(places) == 0.0:
+        return 0.0
+    return float(np.corrcoef(places, curve)[0, 1])
 
 
 @dataclass(frozen=True)
