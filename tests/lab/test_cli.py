@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from hannes_description.model import Model
 from hannes_lab.cli_files import check_writable
-from hannes_lab.cli_show import relative_error
+from hannes_lab.cli_show import _show_conditions, relative_error
 from hannes_lab.compare import MetricRow
+from hannes_lab.diagnosis import Fall
 from hannes_lab.wording import failure_notes
 from hannes_sim.effect import load_effect
 from lab.foreign_bags import hannes, hannes_in_one_line, signals_of_set, write_bag, write_set
@@ -52,6 +53,26 @@ def test_trials(bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pyt
     assert code == 0 and "motor_current" in out and "control period" in out
     code, out, err = hannes("trials", "nowhere", capsys=capsys, monkeypatch=monkeypatch)
     assert code == 2 and "No bag 'nowhere'" in err
+
+
+@pytest.mark.parametrize("count", [1, 3, 9])
+def test_the_error_of_each_condition_is_a_table_of_its_own(
+    count: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Names and numbers stand apart, however many conditions there are."""
+    names = [f"a_condition_with_a_long_name_{k}" for k in range(count)]
+    falls = [
+        Fall(
+            added, 2.0 * ratio, 2.1 * ratio, {c: ratio * (k + 1.5) for k, c in enumerate(names)}, (), {}, 3.3
+        )
+        for added, ratio in (("nominal, as given", 5.0), ("nominal, fitted", 4.0), ("glove_stiffness", 1.0))
+    ]
+    _show_conditions(falls)
+    rows = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    cells = [[cell.strip() for cell in row] for row in rows if "glove" in row[0]]
+    last = [f"{k + 1.5:.3g}" for k in range(count)]
+    shown = {1: [], 3: [["+ glove_stiffness", *last]], 9: [["+ glove_stiffness", "9.5", names[-1]]]}
+    assert cells == shown[count]
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from .add import Addition
 from .compare import Comparison, MetricRow
-from .diagnosis import Diagnosis, has_excess
+from .diagnosis import Diagnosis, Fall, has_excess
 from .experiments import VISIBLE, Experiment
 from .falls import NO_REPEATS, errors_in_units, step_name
 from .report_text import NO_FINDING
@@ -138,8 +138,8 @@ def _show_experiments(console: Console, experiments: Sequence[Experiment]) -> No
         )
 
 
-_LISTED = 3
-"""Conditions that a line of the table names each; of more, the worst alone (all are in --json and the report)."""
+_LISTED = 6
+"""Conditions that the table has a column for each; of more, the worst alone (all are in --json and the report)."""
 
 
 def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> None:
@@ -152,30 +152,44 @@ def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> 
     )
     signals = list(found.falls[-1].held_out_signals)
     table.add_column("model", no_wrap=True)
-    for name in ("training\nclosures", "held-out\nclosures"):
+    for name in ("training\nclosures", "held-out\nclosures", "held-out\nconditions"):
         table.add_column(name, justify="right")
-    table.add_column("held-out\nconditions", overflow="fold")
     for signal in signals:
         table.add_column(_heading(signal, units[signal]), justify="right")
     for k, fall in enumerate(found.falls):
-        known = {c: v for c, v in fall.by_condition.items() if math.isfinite(v)}
-        if len(fall.by_condition) > _LISTED and known:
-            worst = max(known, key=known.__getitem__)
-            conditions = f"at most {number(fall.by_condition[worst], 3)}, {worst}"
-        else:
-            conditions = ", ".join(f"{c} {number(v, 3)}" for c, v in fall.by_condition.items())
-        if len(fall.by_condition) > 1:
-            conditions = f"{number(fall.held_out_conditions, 3)} ({conditions})"
         table.add_row(
             step_name(k, fall.added),
             number(fall.train, 3),
             number(fall.held_out, 3),
-            conditions,
+            number(fall.held_out_conditions, 3),
             *(number(fall.held_out_signals.get(s, math.nan), 3) for s in signals),
         )
     show_table(table, TEXT_WIDTH)
     if signals:
         console.print("The last columns: error of each signal on held-out conditions.", style="dim")
+    _show_conditions(found.falls)
+
+
+def _show_conditions(falls: Sequence[Fall]) -> None:
+    """The error on each condition while it took no part in the fit; of many the largest."""
+    conditions = list(falls[-1].by_condition)
+    if len(conditions) < 2:
+        return
+    table = Table(title="Of each condition, left out of the fit")
+    table.add_column("model", no_wrap=True)
+    listed = len(conditions) <= _LISTED
+    for name in conditions if listed else ("largest", "on condition"):
+        table.add_column(name, justify="left" if name == "on condition" else "right", overflow="fold")
+    for k, fall in enumerate(falls):
+        known = {c: v for c, v in fall.by_condition.items() if math.isfinite(v)}
+        worst = max(known, key=known.__getitem__, default="")
+        cells = (
+            [number(fall.by_condition.get(c, math.nan), 3) for c in conditions]
+            if listed
+            else [number(known.get(worst, math.nan), 3), worst]
+        )
+        table.add_row(step_name(k, fall.added), *cells)
+    show_table(table, TEXT_WIDTH)
 
 
 def _heading(signal: str, unit: str) -> str:
