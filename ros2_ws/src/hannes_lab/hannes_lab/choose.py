@@ -54,10 +54,6 @@ HALF = 0.5
 """Effects that were added one after another are the answer where the error on held-out conditions, above the
 repeatability, falls to this part; where more is left, what is missing is something else."""
 
-MAX_EFFECTS = 3
-MAX_GREEDY = 7
-"""Most effects that are named, by the smallest set that explains all and one after another."""
-
 COUNTS = {1: "one", 2: "two", 3: "three"}
 
 WIDE = (4, 3)

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.output import finite, print_json
-from hannes_sim.effect import load_effect, strength_of
 
-from .add import Addition, add_effects
 from .cli_files import Output, check_files, check_writable, deliver
 from .cli_options import (
     JOBS,
@@ -35,19 +33,13 @@ from .cli_options import (
     Topics,
 )
 from .cli_progress import ConsoleProgress
-from .cli_show import show_addition, show_comparison, show_diagnosis
-from .compare import Comparison
-from .compare import compare as compare_model
-from .diagnose import diagnose as diagnose_model
-from .diagnose import effect_sources
-from .diagnosis import Diagnosis
-from .executor import interruptible
-from .hand import HandRig
-from .own_effect import along_reference, check_own_effects
-from .own_law import check_own_code
-from .prepare import Prepared
-from .provenance import own_command, save_model
-from .session import after, before, executor_of, prepared_from, try_effects
+from .interruptible import interruptible
+
+if TYPE_CHECKING:
+    from .add import Addition
+    from .compare import Comparison
+    from .diagnosis import Diagnosis
+    from .prepare import Prepared
 
 
 def compare(
@@ -70,6 +62,10 @@ def compare(
     json: Json = False,
 ) -> None:
     """Compare the model with recorded closures: where does it fail, and by how much?"""
+    from .cli_show import show_comparison
+    from .compare import compare as compare_model
+    from .session import executor_of, prepared_from
+
     check_files(report)
     prepared = prepared_from(bags, model, objects, signals, rig, scale, JOBS, topics)
     with (
@@ -105,6 +101,11 @@ def diagnose(
     json: Json = False,
 ) -> None:
     """Which physical effect does the model lack: nothing, effects of the catalogue, or something unknown?"""
+    from .cli_show import show_diagnosis
+    from .diagnose import diagnose as diagnose_model
+    from .diagnose import effect_sources
+    from .session import executor_of, prepared_from, try_effects
+
     if model_file is not None and not add:
         raise HannesError(f"--out {model_file}: only --add writes a model file; say --add too.")
     out = model_file or Path("my_hand.yaml")
@@ -144,6 +145,11 @@ def add(
     json: Json = False,
 ) -> None:
     """Add effects to the model, fit them, and show the error fall on held-out data."""
+    from .add import add_effects
+    from .cli_show import show_addition
+    from .diagnose import effect_sources
+    from .session import executor_of, prepared_from, try_effects
+
     check_files(report, out)
     prepared = prepared_from(bags, model, objects, signals, rig, scale, jobs, topics)
     try_effects(prepared, effects or ())
@@ -191,7 +197,12 @@ def hide(
     json: Json = False,
 ) -> None:
     """Make a measurement set with a hidden effect, to test the lab or to learn what an effect looks like."""
+    from hannes_sim.effect import strength_of
+
+    from .hand import HandRig
     from .hide import DEFAULT_CONDITIONS, empty_trial, make_set, write_set
+    from .own_effect import along_reference, check_own_effects
+    from .own_law import check_own_code
 
     check_writable(truth, "The truth")
     wanted: dict[str, float] = {}
@@ -234,6 +245,8 @@ def hide(
 
 def _check_factor(source: str, factor: float) -> None:
     """Refuse a strength that hides nothing, or another one than was asked for."""
+    from hannes_sim.effect import load_effect
+
     main = load_effect(source).strength()
     value = factor * main.typical
     if not math.isfinite(factor) or factor == 0.0 or not main.lower <= value <= main.upper:
@@ -263,6 +276,10 @@ def report(
     json: Json = False,
 ) -> None:
     """Compare, diagnose and add, all on one self-contained HTML page."""
+    from .diagnose import diagnose as diagnose_model
+    from .diagnose import effect_sources
+    from .session import executor_of, prepared_from, try_effects
+
     check_files(out)
     prepared = prepared_from(bags, model, objects, signals, rig, scale, jobs, topics)
     try_effects(prepared, effects or ())
@@ -280,6 +297,9 @@ def report(
 
 
 def _model_file(found: Diagnosis | Addition, path: Path) -> Output:
+    from .diagnosis import Diagnosis
+    from .provenance import own_command, save_model
+
     nearest = isinstance(found, Diagnosis) and found.verdict == "unknown" and found.effects
     remarks = ["of the nearest effects, which are no finding"] if nearest else []
     left_out = sorted({name.partition("@")[0] for name in found.model.provenance["recordings"]})
@@ -292,6 +312,8 @@ def _model_file(found: Diagnosis | Addition, path: Path) -> Output:
 
 def _report_of(path: Path, prepared: Prepared, found: Diagnosis | Addition) -> Output:
     """The report of a model before and after what was found."""
+    from .session import after, before
+
     return _report(path, lambda: (before(prepared, found), after(prepared, found)), found)
 
 
@@ -302,6 +324,7 @@ def _report(
 ) -> Output:
     """A report, or a picture by the ending of its name, of a comparison, and of another after what was found."""
     from .pictures import ENDINGS, write_picture
+    from .provenance import own_command
     from .report import write_report
 
     def write(to: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from joblib import cpu_count
 
-from .choose import MAX_EFFECTS, MAX_GREEDY
+from .limits import MAX_EFFECTS, MAX_GREEDY
 from .trials import SIGNALS as COMPARED
 
 Bags = Annotated[list[Path], typer.Argument(help="Bags, or folders of bags; one bag may hold many closures.")]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from hannes_description.output import TEXT_WIDTH, number, print_json, show_table, text_console, with_unit
@@ -11,9 +11,9 @@ from hannes_description.signals import SIGNALS
 from rich.table import Table
 
 from .cli_options import Bags, Json, Objects, RigFile, Scale, Topics
-from .prepare import as_compared, notes_of
-from .session import trials_from
-from .trials import Trial
+
+if TYPE_CHECKING:
+    from .trials import Trial
 
 
 def trials(
@@ -28,6 +28,9 @@ def trials(
 
     Nothing is simulated: a look at what an adapter, or a bag, gives before the first `compare`.
     """
+    from .prepare import as_compared, notes_of
+    from .session import trials_from
+
     machine, read_in = trials_from(bags, objects, rig, scale, topics)
     found = as_compared(read_in, machine)
     read = [told(trial, "" if machine else SIGNALS["reference_position"].unit) for trial in found]

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hannes_description.errors import HannesError
-from hannes_sim.measurement import Sensors
 from hannes_sim.objects import GraspObject, named_object
+
+if TYPE_CHECKING:
+    from hannes_sim.measurement import Sensors
 
 ZERO_ORDER_HOLD_RATE = 90.0
 STRANGE_HOLD_RATE = 225.0
@@ -60,6 +62,8 @@ def grasp_of(metadata: Mapping[str, Any], source: str) -> GraspObject | None:
 
 def loggers_of(metadata: Mapping[str, Any], source: str) -> Sensors | None:
     """How the metadata say it was logged; None where they do not."""
+    from hannes_sim.measurement import Sensors
+
     given = metadata.get("sensors")
     if given is None:
         return None

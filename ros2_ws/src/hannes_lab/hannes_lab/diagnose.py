@@ -16,8 +16,6 @@ from .adequacy import in_the_law, is_adequate, leads_back, led_off
 from .chance import Chance, chance
 from .choose import (
     EACH_TAKES,
-    MAX_EFFECTS,
-    MAX_GREEDY,
     Choice,
     choose,
     choose_greedily,
@@ -46,6 +44,7 @@ from .features import data_used
 from .fit import Fit, nuisance_table
 from .greedy import OF_NOMINAL
 from .intervals import intervals_of, strain, sway, wider
+from .limits import MAX_EFFECTS, MAX_GREEDY
 from .prepare import Prepared
 from .provenance import falls_made, made_from
 from .screen import usable_effects

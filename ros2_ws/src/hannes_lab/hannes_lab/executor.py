@@ -10,18 +10,16 @@ import functools
 import os
 import re
 import signal
-import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, ParamSpec
+from typing import Any
 
-import typer
 from hannes_description.errors import HannesError
-from hannes_description.stopping import Terminated, end_after_feeders, terminable
+from hannes_description.stopping import end_after_feeders
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
@@ -31,8 +29,6 @@ from .cache import Store, code_hash
 warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given", category=UserWarning)
 # Ctrl-C is one line; that work under way was lost goes without saying.
 warnings.filterwarnings("ignore", message=".*tasks which were still being processed", category=UserWarning)
-
-P = ParamSpec("P")
 
 Work = Callable[..., Any]
 """(shared, key of shared, function, item) -> (result, simulations, failures)"""
@@ -195,23 +191,3 @@ class Held(threading.local):
 def own(rig: Any) -> Any:
     """A rig of one's own: workers that are threads of one process are handed the same object."""
     return copy.deepcopy(rig)
-
-
-def interruptible(command: Callable[P, None]) -> Callable[P, None]:
-    """A command that Ctrl-C ends with one line and exit code 130, and SIGTERM with one line and exit code 143."""
-
-    @functools.wraps(command)
-    def run(*words: P.args, **options: P.kwargs) -> None:
-        try:
-            with terminable():
-                command(*words, **options)
-        except KeyboardInterrupt as why:
-            kept = not options.get("no_cache")
-            rest = (
-                "what was found is kept: the same command goes on from there" if kept else "nothing is kept"
-            )
-            what, code = ("terminated", 143) if isinstance(why, Terminated) else ("interrupted", 130)
-            print(f"\nhannes: {what}; {rest}", file=sys.stderr)
-            raise typer.Exit(code) from None
-
-    return run

@@ -9,14 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from hannes_description.errors import HannesError
 from numba import njit
 from numpy.typing import NDArray
 
-from .rollout import Rollout
+if TYPE_CHECKING:
+    from .rollout import Rollout
 
 Array = NDArray[np.float64]
 Samples = Mapping[str, tuple[Array, Array]]

@@ -62,7 +62,9 @@ COMMANDS: tuple[Command, ...] = (
     Command("diagnose", "hannes_lab.cli:diagnose", "Which physical effect does the model lack?"),
     Command("add", "hannes_lab.cli:add", "Add effects to the model, fit them, show the error fall."),
     Command(
-        "calibrate", "hannes_lab.calibrate:command", "Identify named parameters of your hand from its bags."
+        "calibrate",
+        "hannes_lab.cli_calibrate:calibrate",
+        "Identify named parameters of your hand from its bags.",
     ),
     Command(
         "validate", "hannes_lab.validation.cli:validate", "Hold the model against the thesis, row by row."

@@ -17,7 +17,7 @@ from hannes_description.parameters import data_path
 from ..cache import default_folder
 from ..cli_files import check_model_file
 from ..cli_progress import ConsoleProgress
-from ..executor import interruptible
+from ..interruptible import interruptible
 from . import (
     columns,
     convergence,
