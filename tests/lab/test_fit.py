@@ -54,7 +54,7 @@ class Curved:
 
     def __init__(self) -> None:
         self.simulations = 0
-        self.features = self
+        self.features, self.units = self, frozenset[str]()
 
     def residual(self, model: object, values: dict[str, float]) -> np.ndarray:
         self.simulations += 1

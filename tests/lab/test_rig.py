@@ -20,7 +20,7 @@ from hannes_lab.executor import Executor
 from hannes_lab.falls import error_falls
 from hannes_lab.features import compact_end
 from hannes_lab.fit import Fit, finite_differences, fit, prior_weights
-from hannes_lab.forces import Forces
+from hannes_lab.forces import Forces, scaling
 from hannes_lab.greedy import _left_open
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import effect_coordinates
@@ -176,12 +176,12 @@ def test_a_factor_on_all_forces_is_told_by_the_tolerances_alone(
     search = Search(prepared.problem, prepared.model, prepared.nuisances, sources)
     found = search.polish(search.fitted(["coulomb_friction"]))
     priors = prior_weights(found.fit.coordinates)
-    forces = Forces(found.fit.coordinates, found.fit.z)
+    forces = Forces(found.fit.coordinates, found.fit.z, scaling(search.problem, found.fit.model))
     names = [c.name for c in found.fit.coordinates]
     assert {names[j] for j in forces.powers} == {
         *("motor.kt", "motor.armature", "friction.viscous", "coulomb_friction.level")
     }
-    best = forces.likeliest(priors)
+    best = forces.scaled(forces.likeliest(priors))
     assert (
         float((priors * found.fit.z) @ (priors * found.fit.z))
         <= float((priors * best) @ (priors * best)) + 0.2
@@ -198,6 +198,72 @@ def test_a_factor_on_all_forces_is_told_by_the_tolerances_alone(
     )
     assert np.abs(wide.jacobian @ forces.direction()).max() < 1e-6 * np.abs(wide.jacobian).max()
     assert np.abs(blurred.jacobian @ forces.direction()).max() > 0.0
+
+
+def test_without_a_current_a_resistance_is_known_as_well_as_all_forces_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a drive in volts: half the resistance moves twice the mass against twice the friction just so."""
+    sds = {"motor.resistance": 0.2, "motor.armature": 0.2, "friction.viscous": 0.5, "friction.coulomb": 0.3}
+    write_files(tmp_path)
+    (tmp_path / "tolerances.yaml").write_text(
+        "motor.kt: {sd: 0.05, closure_sd: 0.0, unit: '1', source: test}\n"
+        + "".join(f"{n}: {{sd: {sd}, closure_sd: 0.0, unit: '1', source: test}}\n" for n, sd in sds.items())
+    )
+    parameter = "{{value: {}, unit: {}, lower: {}, upper: {}, status: assumed, source: test}}"
+    (tmp_path / "parameters.yaml").write_text(
+        f"supply: {{voltage: {parameter.format(50.0, 'V', 1.0, 100.0)}}}\n"
+        f"motor:\n  resistance: {parameter.format(4.0, 'ohm', 0.5, 40.0)}\n"
+        f"  kt: {parameter.format(5.0, 'N/A', 1.0, 20.0)}\n  armature: {parameter.format(2.0, 'kg', 0.2, 20.0)}\n"
+        f"friction:\n  viscous: {parameter.format(4.0, 'N.s/m', 0.0, 50.0)}\n"
+        f"  coulomb: {parameter.format(3.0, 'N', 0.0, 30.0)}\n"
+    )
+    rig, model = load_rig(ADAPTER), Model.load(tmp_path / "mass.yaml")
+    path = reference(3)
+    run = rollout(
+        make_plant(model.with_values({"motor.resistance": 4.6})), rig([]).controller(model, 1e-3), path
+    )
+    moves = [
+        Closure(a, b, f"{path[round(a / 1e-3)]:.2f} to {path[round(b / 1e-3)]:.2f}")
+        for a, b in find_moves(path, 1e-3)
+    ]
+    noise = 2e-6 * np.random.default_rng(2).standard_normal((2, path.size))
+    signals = {
+        "encoder_position": (run.time, run.encoder_position + noise[0]),
+        "drive_force": (run.time, run.motor_voltage + noise[1]),
+    }
+    units = {"encoder_position": "m", "drive_force": "V"}
+    monkeypatch.setattr(rig, "population", tmp_path / "tolerances.yaml")
+    trial = Trial("mass", 1e-3, path, signals, tuple(moves), units=units)
+    prepared = prepare([trial], model, rig=rig)
+    problem = prepared.problem
+    assert scaling(problem, model)["ohm"] == -1.0
+    in_amperes = replace(trial, units={**units, "drive_force": "A"})
+    told = replace(
+        prepared.features,
+        trials=(in_amperes,),
+        blocks=tuple(
+            replace(b, unit="A") if b.signal == "drive_force" else b for b in prepared.features.blocks
+        ),
+    )
+    assert scaling(replace(problem, features=told), model) == {}
+
+    search = Search(problem, model, prepared.nuisances, effect_sources(only=["cogging"], model=model))
+    found = search.null()
+    wide = search.with_spread(found).fit
+    names = [c.name for c in wide.coordinates]
+    together = sum(sd**-2 for sd in sds.values()) ** -0.5
+    at = names.index("motor.resistance")
+    value = wide.values["motor.resistance"]
+    sd = wide.sd()[at] * abs(wide.coordinates[at].value(wide.z[at] + 1.0) - value) / value
+    assert 0.6 * together < sd < 1.3 * together
+    blurred = replace(
+        wide,
+        jacobian=finite_differences(
+            problem, wide.model, wide.coordinates, wide.z, wide.residual, range(len(names)), {}
+        ),
+    )
+    assert blurred.sd()[at] < 0.5 * wide.sd()[at]
 
 
 def test_what_is_no_shift_in_time_is_left_where_it_is() -> None:

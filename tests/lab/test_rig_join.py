@@ -240,3 +240,20 @@ def test_closures_of_a_condition_in_trials_of_several_are_said_to_be_no_repeats(
     (note,) = (n for t in join_trials([one, two]) for n in t.notes if "not taken for repeats" in n)
     assert str(note).startswith("up: in several trials (up0, up1) of which some hold other conditions too")
     assert not any("not taken for repeats" in n for t in join_trials([one]) for n in t.notes)
+
+
+def test_a_recording_that_differs_from_many_of_its_condition_is_left_out(rig: type) -> None:
+    """One that was stuck, whichever of them it is; where half of them differ nobody knows which are right."""
+    good = moves(rig, "push", 0.1, 0.0, 7, fresh=True)
+    time, position = good[0].signals["encoder_position"]
+    stuck = replace(
+        good[0], name="stuck", signals={**good[0].signals, "encoder_position": (time, 0.3 * position)}
+    )
+    for order in ([stuck, *good[1:]], [*good[1:4], stuck, *good[4:]]):
+        (joined,) = join_trials(order)
+        assert len(joined.closures) == 6 and "stuck" not in {part.name for part in joined.parts}
+        (note,) = (note for note in joined.notes if "left out" in note)
+        assert "stuck of condition 'push', unlike its 6 other closures: encoder_position differs by" in note
+    half = [replace(stuck, name=f"stuck{k}") for k in range(4)]
+    apart = join_trials([*half, *good])
+    assert sorted(len(trial.closures) for trial in apart) == [4, 7]

@@ -156,6 +156,11 @@ class Features:
         return tuple(dict.fromkeys(block.condition for block in self.blocks))
 
     @property
+    def units(self) -> frozenset[str]:
+        """Of what is compared."""
+        return frozenset(block.unit for block in self.blocks)
+
+    @property
     def repeated(self) -> bool:
         """Whether anything was recorded more than once, so that there is a repeatability."""
         return any(block.n > 1 for block in self.blocks)

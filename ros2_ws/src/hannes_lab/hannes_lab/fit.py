@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 from hannes_description.model import Model
-from hannes_description.units import in_volts
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from .forces import Forces
+from .forces import Forces, scaling
 from .problem import Coordinate, Problem
 
 Array = NDArray[np.float64]
@@ -224,9 +223,8 @@ OFF_BOUND = 0.02
 be cut short by it."""
 
 
-UNSCALED = 0.1
-"""Whitened change of a simulation by a factor on all forces up to which the data say nothing of that factor: a
-hundredth of what the priors do."""
+FACTOR_PARTS = (1.0, 0.5, 0.25)
+"""Of the way to the factor on all forces that the priors like best: what is held fixed may tell a little of it."""
 
 UNSEEN = 1e-3
 """Where only a part of the features takes part in a fit: weight with which a strength or a shape without a prior is
@@ -235,23 +233,26 @@ have been fitted to the rest."""
 
 
 def without_scale(problem: Problem, found: Fit) -> Fit:
-    """The fit with derivatives that tell nothing of a factor on all forces, where a simulation shows that none does.
+    """The fit with derivatives that tell no more of a factor on all forces than a simulation shows of it.
 
-    By so much as the priors leave it open, it may change next to nothing.
+    Each force by itself moves the data much, and all together little: as a difference of their derivatives that is
+    mostly roughness.  By so much as the priors leave it open, the factor is simulated, and where that moves the data
+    less than the derivatives say, they are made to say what it does.
     """
-    if in_volts(found.model.parameters):
-        return found
-    forces = Forces(found.coordinates, found.z)
+    forces = Forces(found.coordinates, found.z, scaling(problem, found.model))
     along = forces.direction()
     slope = prior_weights(found.coordinates) * along
     if not slope.any():
         return found
-    moved = forces.scaled(1.0 / float(np.linalg.norm(slope)))
+    step = 1.0 / float(np.linalg.norm(slope))
+    moved = forces.scaled(step)
     values = {c.name: c.value(float(z)) for c, z in zip(found.coordinates, moved, strict=True)}
-    if np.linalg.norm(problem.residual(found.model, values) - found.residual) > UNSCALED:
+    failures = problem.failures
+    seen = (problem.residual(found.model, values) - found.residual) / step
+    said = found.jacobian @ along
+    if problem.failures > failures or not np.linalg.norm(seen) < np.linalg.norm(said):
         return found
-    told = found.jacobian @ along / float(along @ along)
-    return replace(found, jacobian=found.jacobian - np.outer(told, along))
+    return replace(found, jacobian=found.jacobian + np.outer(seen - said, along) / float(along @ along))
 
 
 class Derivatives:
@@ -446,13 +447,18 @@ def fit(
         if unseen.any():
             z = np.where(unseen, np.clip(0.0, bounds[0] + edge, bounds[1] - edge), z)
             r = residual_at(z)
-    if complete and not in_volts(model.parameters):  # a back-EMF tells the factor
-        other = np.clip(Forces(coordinates, z).likeliest(priors), bounds[0] + edge, bounds[1] - edge)
-        # Only where the priors alone would gain by it is it worth a simulation.
-        if (priors * z) @ (priors * z) - (priors * other) @ (priors * other) > LEAST_GAIN:
+    if complete:
+        forces = Forces(coordinates, z, scaling(problem, model))
+        whole = forces.likeliest(priors)
+        for part in FACTOR_PARTS:
+            other = np.clip(forces.scaled(part * whole), bounds[0] + edge, bounds[1] - edge)
+            # Only where the priors alone would gain by it is it worth a simulation.
+            if (priors * z) @ (priors * z) - (priors * other) @ (priors * other) <= LEAST_GAIN:
+                break
             there = residual_at(other)
             if cost(there, other) < cost(r, z):
                 z, r = other, there
+                break
     if exact and not derivatives.fresh:
         derivatives.forget()
     jacobian = derivatives.at(z, r)

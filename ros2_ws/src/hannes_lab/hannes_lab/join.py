@@ -33,6 +33,10 @@ LARGE = 1e-3
 """Recordings begin anew where the encoder's rest moves over them with no more than this chance of it being scatter, and
 by more than this part of its span."""
 
+STRAY = 3
+"""Times as many closures of a condition that agree with one another, ENOUGH of them, than some that do not: those are
+left out."""
+
 SHORT = 0.8
 """Part of the usual length below which the shortest closure, to which all are cut, is spoken of."""
 
@@ -65,6 +69,10 @@ def join_repeats(loaded: Sequence[Loaded], alike: float = ALIKE) -> list[Trial]:
     signals, units and description (object, logger), the same reference, and mean closures that are `alike`.  What
     is joined already stays as it is.  Whether each begins anew is said by the trials (`fresh`), or seen.
     """
+    return _joined_groups(_grouped(loaded, alike))
+
+
+def _grouped(loaded: Sequence[Loaded], alike: float) -> list[list[Loaded]]:
     groups: list[list[Loaded]] = []
     for one in loaded:
         group = next((g for g in groups if _one_object([*g, one]) and not _unlike(g[0], one, alike)), None)
@@ -72,15 +80,23 @@ def join_repeats(loaded: Sequence[Loaded], alike: float = ALIKE) -> list[Trial]:
             groups.append([one])
         else:
             group.append(one)
+    return groups
+
+
+def _joined_groups(groups: Sequence[list[Loaded]]) -> list[Trial]:
     several = [[one.trial for one in group] for group in groups if len(group) > 1]
     found = _fresh([trials for trials in several if not trials[0].fresh])
     return [trial for group in groups for trial in _one_or_all(group, group[0].trial.fresh or found)]
 
 
 def join_trials(trials: Sequence[Trial]) -> list[Trial]:
-    """A rig's trials, joined as bags are: those that repeat a condition have its name in common."""
+    """A rig's trials, joined as bags are: those that repeat a condition have its name in common.
+
+    Few that differ from many of their condition, which agree, are left out with a note.
+    """
     loaded = [Loaded(trial, trial.conditions[0]) for trial in trials]
-    joined = join_repeats(loaded, SAID)
+    groups, left_out = _without_strays(_grouped(loaded, SAID))
+    joined = _joined_groups(groups)
     apart: dict[str, list[Trial]] = {}
     for trial in joined:
         if len(trial.conditions) == 1 and len(trial.closures) < ENOUGH:
@@ -91,11 +107,36 @@ def join_trials(trials: Sequence[Trial]) -> list[Trial]:
         for condition, of_one in apart.items()
         if len(of_one) > 1
     ]
+    said += left_out
     said += _scattered(joined)
     said += _with_others(joined)
     first, *others = joined
     told = tuple(OfAll(note) for note in said if note not in first.notes)
     return [replace(first, notes=(*first.notes, *told)), *others]
+
+
+def _without_strays(groups: Sequence[list[Loaded]]) -> tuple[list[list[Loaded]], list[str]]:
+    """The groups without those whose recordings differ from STRAY times as many of their condition, and why each is."""
+    kept, said = [], []
+    for group in groups:
+        others = [g for g in groups if g is not group and g[0].kind == group[0].kind]
+        many = max(others, key=_closures, default=[])
+        if not (
+            _closures(many) >= max(ENOUGH, STRAY * _closures(group))
+            and not _unlike(many[0], group[0], math.inf)
+        ):
+            kept.append(group)
+            continue
+        names = ", ".join(one.trial.name for one in group)
+        why = _unlike(many[0], group[0], SAID)
+        said.append(
+            f"left out: {names} of condition '{group[0].condition}', unlike its {_closures(many)} other closures: {why}"
+        )
+    return kept, said
+
+
+def _closures(group: Sequence[Loaded]) -> int:
+    return sum(len(one.trial.closures) for one in group)
 
 
 def _with_others(trials: Sequence[Trial]) -> list[str]:
@@ -125,7 +166,9 @@ def _why_apart(loaded: Sequence[Loaded]) -> str:
     first = loaded[0]
     for other in loaded[1:]:
         if unlike := _unlike(first, other, SAID):
-            return f"{unlike} ({first.trial.name}, {other.trial.name})"
+            signals = not _unlike(first, other, math.inf)
+            advice = "; name what differs as a condition of its own, or leave one out" if signals else ""
+            return f"{unlike}{advice} ({first.trial.name}, {other.trial.name})"
     if first.trial.fresh:
         apart = _joined(loaded, fresh=True).apart
         return (
@@ -250,8 +293,7 @@ def _unlike(one: Loaded, other: Loaded, alike: float) -> str:
     if far[signal] <= alike:
         return ""
     return (
-        f"{signal} differs by {100 * far[signal]:.0f} % of its span, where repeats may by {100 * alike:.0f} %; "
-        "name what differs as a condition of its own, or leave one out"
+        f"{signal} differs by {100 * far[signal]:.0f} % of its span, where repeats may by {100 * alike:.0f} %"
     )
 
 

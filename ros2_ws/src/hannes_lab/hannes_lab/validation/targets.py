@@ -53,8 +53,9 @@ class Target:
 
 
 @dataclass(frozen=True)
-class _Size:
+class _Figures:
     size: int
+    units: frozenset[str]
 
 
 @dataclass
@@ -73,8 +74,8 @@ class TargetProblem:
     failed: float = FAILED
 
     @property
-    def features(self) -> _Size:
-        return _Size(len(self.targets))
+    def features(self) -> _Figures:
+        return _Figures(len(self.targets), frozenset(target.unit for target in self.targets))
 
     @property
     def key(self) -> str:
