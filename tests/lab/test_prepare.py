@@ -27,3 +27,21 @@ def test_closures_that_drift_are_said_to() -> None:
     worn = replace(fast, signals={**fast.signals, "motor_current": less})
     (said,) = drifts(build_features([worn, trials[1]], ["motor_current"]))
     assert said.startswith("fast: the closures drift") and "of the scatter of motor_current" in said
+
+
+def test_few_closures_of_each_condition_show_a_drift_together() -> None:
+    recordings, _ = make_set(Model.load(), [], seed=5, closures=5, conditions=("fast", "slow", "grasp"))
+    trials = [make_trial(r) for r in recordings]
+    assert drifts(build_features(trials, ["motor_current"])) == []
+    worn = []
+    for trial in trials:
+        time, current = trial.signals["motor_current"]
+        signals = {**trial.signals, "motor_current": (time, current * (1.0 - 0.2 * time / time[-1]))}
+        worn.append(replace(trial, signals=signals))
+    (said,) = drifts(build_features(worn, ["motor_current"]))
+    assert said.startswith("in all conditions alike the closures drift from the first to the last")
+    # what changes one way in one condition and the other way in another is no drift of the machine
+    opposite = worn[0].signals["motor_current"]
+    there = (opposite[0], trials[0].signals["motor_current"][1] * (0.8 + 0.2 * opposite[0] / opposite[0][-1]))
+    worn[0] = replace(worn[0], signals={**worn[0].signals, "motor_current": there})
+    assert drifts(build_features(worn, ["motor_current"])) == []

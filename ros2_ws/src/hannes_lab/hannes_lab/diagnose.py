@@ -52,6 +52,7 @@ from .search import FAR, PENALTY, Candidate, Progress, Search, silent
 from .twins import twins
 from .wording import (
     bent_sentence,
+    condition_apart,
     far_off,
     idle_sentence,
     law_sentence,
@@ -203,6 +204,7 @@ def diagnose(
             *((choice.left,) if choice.left and not unknown else ()),
             *notes(search, best, verdict, effects, experiments, greedy, clock),
             *(lead(choice, falls) if verdict == "effects" else ()),
+            *(() if unknown else condition_apart(falls)),
             *worse_fitted(falls),
         ),
         simulations=prepared.problem.simulations,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,16 +23,38 @@ def drift_of(block: Block) -> float:
     Mann-Kendall test (Mann 1945, Kendall 1975) of the closures along their first principal component.  Fewer than ten
     cannot show it.
     """
-    n = block.n
-    if n < 3:
+    if block.n < 3:
         return 0.0
-    away = block.measured - block.measured.mean(axis=0)
-    scores, sizes, _ = np.linalg.svd(away, full_matrices=False)
-    rising = int(np.sign(scores[None, :, 0] - scores[:, None, 0])[np.triu_indices(n, 1)].sum())
-    sd = math.sqrt(n * (n - 1) * (2 * n + 5) / 18.0)
-    if 2.0 * ndtr((1 - abs(rising)) / sd) >= DRIFT:
+    rising, variance, share = _trend(block.measured)
+    return share if _by_chance(rising, variance) < DRIFT else 0.0
+
+
+def drift_together(curves: Sequence[Array]) -> float:
+    """Part of the scatter of several conditions' closures, each (n, p), that drifts alike; 0 where chance may do it.
+
+    The same test of all at once (Hirsch 1982): few closures of each show together what none shows alone.
+    """
+    found = [_trend(own) for own in curves if own.shape[0] > 2]
+    rising, variance = sum(one[0] for one in found), sum(one[1] for one in found)
+    if not found or _by_chance(rising, variance) >= DRIFT:
         return 0.0
-    return float((sizes[0] / np.linalg.norm(sizes)) ** 2)
+    return float(np.mean([one[2] for one in found]))
+
+
+def _trend(curves: Array) -> tuple[int, float, float]:
+    """Kendall's sum of n closures (n, p) along their first principal component, its variance by chance, and the part
+    of their scatter in that component; positive where they grow in the sense of their mean."""
+    n, mean = curves.shape[0], curves.mean(axis=0)
+    scores, sizes, along = np.linalg.svd(curves - mean, full_matrices=False)
+    sense = 1.0 if along[0] @ (mean - mean[0]) >= 0.0 else -1.0
+    rising = int(np.sign(scores[None, :, 0] - scores[:, None, 0])[np.triu_indices(n, 1)].sum() * sense)
+    whole = float(np.linalg.norm(sizes))
+    share = float((sizes[0] / whole) ** 2) if whole > 0.0 else 0.0
+    return rising, n * (n - 1) * (2 * n + 5) / 18.0, share
+
+
+def _by_chance(rising: int, variance: float) -> float:
+    return 2.0 * float(ndtr((1 - abs(rising)) / math.sqrt(variance)))
 
 
 def steadied(deviations: Array) -> Array:

@@ -13,10 +13,11 @@ from hannes_bags.storage import existing, find_bags
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_sim.effect import call_own
+from numpy.typing import NDArray
 
 from .adapter import check_rig, check_trials, other_units
 from .blocks import in_blocks, told_apart
-from .drift import drift_of
+from .drift import drift_of, drift_together
 from .features import Features, build_features
 from .fit import fit
 from .grasp import with_seen_objects
@@ -296,16 +297,32 @@ def notes_of(trials: Sequence[Trial]) -> list[str]:
 
 
 def drifts(features: Features, machine: str = "hand") -> list[str]:
-    """A sentence for each condition whose closures change steadily from the first to the last."""
+    """A sentence for each condition whose closures change steadily from the first to the last, or for all together."""
     out = []
+    advice = (
+        f"which the repeatability holds for chance: let the {machine} warm up or run in, then record again"
+    )
     for condition in features.conditions:
         own = {block.signal: drift_of(block) for block in features.blocks if block.condition == condition}
         if any(own.values()):
             shares = ", ".join(
                 f"{100.0 * share:.0f} % of the scatter of {signal}" for signal, share in own.items() if share
             )
-            out.append(
-                f"{condition}: the closures drift from the first to the last ({shares}), which the repeatability holds "
-                f"as if it were chance: let the {machine} warm up or run in, then record again"
-            )
-    return out
+            out.append(f"{condition}: the closures drift from the first to the last ({shares}), {advice}")
+    return out or _drifts_together(features, advice)
+
+
+def _drifts_together(features: Features, advice: str) -> list[str]:
+    """The same of all conditions, where none shows it alone."""
+    curves: dict[str, list[NDArray[np.float64]]] = {}
+    for block in features.blocks:
+        # Of recordings that begin anew the most typical one stands first, the others in their order.
+        first = 1 if features.trials[block.trial].fresh and features.trials[block.trial].parts else 0
+        curves.setdefault(block.signal, []).append(block.measured[first:])
+    shares = {signal: drift_together(own) for signal, own in curves.items() if len(own) > 1}
+    said = ", ".join(f"{100.0 * share:.0f} % of the scatter of {s}" for s, share in shares.items() if share)
+    return (
+        [f"in all conditions alike the closures drift from the first to the last ({said}), {advice}"]
+        if said
+        else []
+    )

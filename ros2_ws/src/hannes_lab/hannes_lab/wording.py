@@ -199,6 +199,25 @@ def worse_fitted(falls: Sequence[Fall]) -> tuple[str, ...]:
     )
 
 
+APART = 2.0
+"""Multiples of the repeatability, and of the error of all conditions together, from which one that was left out of the
+fit is worth a note."""
+
+
+def condition_apart(falls: Sequence[Fall]) -> tuple[str, ...]:
+    """A sentence on the condition that is foretold much worse than the others together, if there is one."""
+    last = falls[-1]
+    known = {name: error for name, error in last.by_condition.items() if np.isfinite(error)}
+    worst = max(known, key=known.__getitem__, default="")
+    if len(known) < 2 or known[worst] < APART * max(1.0, last.held_out_conditions):
+        return ()
+    return (
+        f"'{worst}' is missed by {known[worst]:.2f} times its repeatability when it takes no part in the fit, all "
+        f"conditions together by {last.held_out_conditions:.2f}: something may act there that the others do not show, "
+        "or nothing else shows what acts there",
+    )
+
+
 def notes(
     search: Search,
     best: Candidate,
@@ -416,6 +435,12 @@ def failure_notes(problem: Problem) -> list[str]:
     ]
 
 
+LATE_COMMAND = (
+    "; if the clock is right and the drive answers that late, it is command_delay, which `diagnose` looks for in what "
+    "was recorded"
+)
+
+
 @dataclass(frozen=True)
 class Clock:
     """Another clock of the reference: what part of the misfit it would remove, and a sentence on it."""
@@ -445,7 +470,9 @@ def other_clock(problem: Problem, found: Fit) -> Clock | None:
         part,
         f"what is left looks as if the signals were {'later' if delay > 0.0 else 'earlier'} than the reference's clock "
         f"says, by {1e3 * abs(delay):.2g} ms: that alone would remove {100.0 * part:.0f} % of the misfit; mend it "
-        f"where the recordings are read, or let it be fitted ({REFERENCE_DELAY} in an adapter's tolerances)",
+        f"where the recordings are read, or let it be fitted ({REFERENCE_DELAY} in an adapter's tolerances)"
+        + LATE_COMMAND
+        * (delay > 0.0),
     )
 
 
