@@ -61,6 +61,29 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
     return prepare(rig.read([path]), Model.load(path.parent / "mass.yaml"), rig=rig)
 
 
+def test_a_bridge_that_coasts_takes_the_back_emf_away_between_its_pulses() -> None:
+    """At half the supply a motor without load runs at twice the speed: it is braked half of the time only."""
+    source = f"{SHOWN / 'coasting_bridge.py'}:CoastingBridge"
+    effect = load_effect(source)
+    model = Model.load().with_values({"hand.preload": 0.0, "hand.stiffness": 0.0, "friction.viscous": 0.0})
+    model = model.with_values({"friction.coulomb": 0.0, "hand.coulomb": 0.0, "hand.viscous": 0.0})
+    emf = model.parameters.value("motor.kt") * model.parameters.value("gear.ratio")
+    supply = model.parameters.value("supply.voltage")
+
+    def speed(part: float, share: float) -> float:
+        with_it = model.with_effect(effect.entry({"emf": share * emf}, source=source))
+        plant = make_plant(with_it)
+        plant.set("hand.travel", 1e6)
+        plant.advance(part * supply, 8000)
+        before = plant.read().position
+        plant.advance(part * supply, 400)
+        return (plant.read().position - before) / (400 * plant.dt)
+
+    assert speed(0.5, 0.0) == pytest.approx(0.5 * supply / emf, rel=0.02)
+    assert speed(0.5, 1.0) == pytest.approx(supply / emf, rel=0.02)
+    assert speed(1.0, 1.0) == pytest.approx(speed(1.0, 0.0), rel=1e-6)
+
+
 def test_what_swings_is_unknown_and_its_frequency_is_said(prepared: Prepared, executor: Executor) -> None:
     only = ["coulomb_friction", "cogging", "command_delay", "gearbox_inertia"]
     found = diagnose(prepared, effect_sources(only=only, model=prepared.model), executor=executor)

@@ -166,19 +166,26 @@ def _along(law: _Between, run: Rollout, value: float = _FILL, place: tuple[int, 
     given = np.column_stack(
         [run.reference_position, run.encoder_position, run.encoder_velocity, run.motor_current]
     )
-    voltages = np.empty(run.time.size)
     with watched():
-        _replay(law.address, law.inputs, law.parameters, law.states, given, law.period, voltages)
-    return voltages
+        return _replay(law.address, law.inputs, law.parameters, law.states, given, law.period)
+
+
+def replay(law: Controller, given: Array) -> Array:
+    """Commands (n,) of a law for references, positions, velocities and currents (n, 4), from the states that it has."""
+    inputs = np.zeros(N_CONTROL_INPUTS)
+    commands: Array = _replay(law.address, inputs, law.parameters, law.states, given, law.period)
+    return commands
 
 
 @njit(cache=True)
-def _replay(address, x, p, s, given, period, voltages):  # type: ignore[no-untyped-def]
+def _replay(address, x, p, s, given, period):  # type: ignore[no-untyped-def]
+    voltages = np.empty(given.shape[0])
     for k in range(voltages.size):
         for j in range(4):
             x[_GIVEN[j]] = given[k, j]
         x[C_PERIOD], x[C_TIME] = period, k * period
         voltages[k] = call_control(address, x.ctypes.data, p.ctypes.data, s.ctypes.data)
+    return voltages
 
 
 def _same(a: Array, b: Array) -> bool:

@@ -24,6 +24,7 @@ from .grasp import with_seen_objects
 from .hand import HandRig, other_plant
 from .join import Loaded, join_repeats, join_trials
 from .lags import with_one_clock
+from .law_check import law_notes
 from .own_law import check_own_code
 from .problem import Problem, build_problem, nuisance_coordinate
 from .rig import Nuisance, PlantRig, Rig, check_parameters
@@ -202,7 +203,7 @@ def prepare(
         made = HandRig(trials)
     wired = "wire.stiffness" in model.names and model.named("wire.stiffness").value > 0.0
     made.one_mass = model.plant == "reduced" and not wired
-    told = [] if isinstance(made, HandRig) else check_rig(made)
+    told = [] if isinstance(made, HandRig) else [*check_rig(made), *law_notes(made, model)]
     features = build_features(trials, _present(trials, signals), made.points, made.finest, made.same)
     nuisances = tuple(made.nuisances(model))
     coordinates = [nuisance_coordinate(n) for n in nuisances]

@@ -1,0 +1,103 @@
+"""A control law that does not give what was recorded is said before anything is fitted with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hannes_description.model import Model
+from hannes_lab.law_check import law_notes
+from hannes_lab.prepare import prepare
+from hannes_lab.rig import PlantRig, load_rig
+from hannes_lab.trials import Closure, Trial, find_moves
+from hannes_sim.factory import make_plant
+from hannes_sim.rollout import rollout
+from lab.single_mass_rig import Law, reference, write_files
+
+ADAPTER = f"{Path(__file__).parent / 'single_mass_rig.py'}:SingleMass"
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory) -> tuple[type[PlantRig], Model, Trial]:
+    """An axis, its model, and a recording of it at every tick; its mass is another one than the model's."""
+    folder = tmp_path_factory.mktemp("axis")
+    write_files(folder)
+    base, model = load_rig(ADAPTER), Model.load(folder / "mass.yaml")
+    rig = type("Axis", (base,), {"population": folder / "tolerances.yaml"})
+    path = reference(2)
+    true = model.with_values({"motor.armature": 2.6})
+    run = rollout(make_plant(true), rig([]).controller(true, 1e-3), path)
+    moves = [
+        Closure(a, b, f"{path[round(a / 1e-3)]:.2f} to {path[round(b / 1e-3)]:.2f}")
+        for a, b in find_moves(path, 1e-3)
+    ]
+    signals = {
+        "encoder_position": (run.time, run.encoder_position),
+        "drive_force": (run.time, run.motor_voltage),
+    }
+    trial = Trial(
+        "axis", 1e-3, path, signals, tuple(moves), units={"drive_force": "N", "encoder_position": "m"}
+    )
+    return rig, model, trial
+
+
+def with_signals(trial: Trial, **signals: tuple[np.ndarray, np.ndarray]) -> Trial:
+    return replace(trial, signals={**trial.signals, **signals})
+
+
+def noisy(trial: Trial) -> Trial:
+    rng = np.random.default_rng(1)
+    (time, position), (_, force) = trial.signals["encoder_position"], trial.signals["drive_force"]
+    return with_signals(
+        trial,
+        encoder_position=(time, position + 1e-6 * rng.standard_normal(time.size)),
+        drive_force=(time, force + 0.02 * rng.standard_normal(time.size)),
+    )
+
+
+def of_gains(rig: type[PlantRig], kp: float, kd: float) -> type[PlantRig]:
+    """The same adapter with another law."""
+
+    class Other(Law):
+        def __init__(self, parameters: object, period: float) -> None:
+            super().__init__(parameters, period)
+            self.parameters = np.array([kp, kd])
+
+    return type("Other", (rig,), {"controller": lambda self, model, period: Other(None, period)})
+
+
+def test_the_law_of_the_machine_is_not_spoken_of(machine: tuple[type[PlantRig], Model, Trial]) -> None:
+    rig, model, trial = machine
+    assert law_notes(rig([trial]), model) == law_notes(rig([noisy(trial)]), model) == []
+
+
+@pytest.mark.parametrize(("kp", "kd"), [(800.0 * 180.0 / np.pi, 60.0), (800.0, 0.06), (1600.0, 60.0)])
+def test_a_gain_in_another_unit_is_said(
+    kp: float, kd: float, machine: tuple[type[PlantRig], Model, Trial]
+) -> None:
+    rig, model, clean = machine
+    trial = noisy(clean)
+    (said,) = law_notes(of_gains(rig, kp, kd)([trial]), model)
+    assert "the control law gives a drive_force that differs from the recorded one by" in said
+    assert said in prepare([trial], model, rig=of_gains(rig, kp, kd)).notes
+
+
+@pytest.mark.parametrize(("shift", "row"), [(1, "before"), (-1, "after")])
+def test_a_command_that_stands_a_row_off_is_said(
+    shift: int, row: str, machine: tuple[type[PlantRig], Model, Trial]
+) -> None:
+    rig, model, trial = machine
+    time, force = trial.signals["drive_force"]
+    (said,) = law_notes(rig([with_signals(trial, drive_force=(time, np.roll(force, shift)))]), model)
+    assert f"the recorded drive_force is what the control law gives for the row {row} it" in said
+
+
+def test_a_log_that_is_slower_than_the_loop_cannot_tell(
+    machine: tuple[type[PlantRig], Model, Trial],
+) -> None:
+    rig, model, trial = machine
+    time, position = trial.signals["encoder_position"]
+    slow = with_signals(trial, encoder_position=(time[::10], position[::10]))
+    assert law_notes(of_gains(rig, 8.0, 0.6)([slow]), model) == []
