@@ -61,3 +61,38 @@ def test_all_bags_are_described_or_none(tmp_path: Path) -> None:
         describe([good], {"object": float("nan")})
     assert (good / "metadata.yaml").read_bytes() == before
     assert sorted(path.name for path in good.iterdir()) == ["good_0.mcap", "metadata.yaml"]
+
+
+def test_what_others_have_said_stays_as_they_wrote_it(tmp_path: Path) -> None:
+    """A recorder writes its texts without quotes; in YAML 1.1 many of them are numbers, times and truths."""
+    bag = foreign_bag(tmp_path / "bag", motor_messages(STAMPS), StoragePlugin.MCAP)
+    file = bag / "metadata.yaml"
+    texts = {"time": "12:30:00", "run": "007", "flag": "yes", "serial": "0x1F", "day": "2025-11-28"}
+    said = "".join(f"    {key}: {text}\n" for key, text in texts.items())
+    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    content["rosbag2_bagfile_information"].pop("custom_data", None)
+    head = "rosbag2_bagfile_information:\n"
+    plain = yaml.safe_dump(content, sort_keys=False).replace(head, f"{head}  custom_data:\n{said}", 1)
+    file.write_text(plain + "beside: it\n", encoding="utf-8")
+    describe([bag], {"object": "none"})
+    assert described(bag) == {**texts, "object": "none"}
+    again = file.read_text(encoding="utf-8")
+    assert yaml.safe_load(again)["beside"] == "it"
+    assert yaml.safe_load(again)["rosbag2_bagfile_information"]["custom_data"] == {
+        **texts,
+        "object": '"none"',
+    }
+    assert read_bag(bag).metadata["run"] == "007"
+
+
+def test_a_folder_that_takes_no_file_is_said_before_any_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bags = [write_recording(recording(n=100, names=MOTOR), tmp_path / name) for name in ("a", "b")]
+    before = (bags[0] / "metadata.yaml").read_bytes()
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != bags[1])
+    with pytest.raises(
+        HannesError, match=r"Cannot write .*b.metadata\.yaml: nothing can be written into its folder"
+    ):
+        describe(bags, {"object": "soft"})
+    assert (bags[0] / "metadata.yaml").read_bytes() == before

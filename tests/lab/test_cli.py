@@ -14,7 +14,7 @@ from hannes_lab.cli_files import check_writable
 from hannes_lab.cli_show import _show_conditions, relative_error
 from hannes_lab.compare import MetricRow
 from hannes_lab.diagnosis import Fall
-from hannes_lab.wording import failure_notes
+from hannes_lab.wording import condition_apart, failure_notes
 from hannes_sim.effect import load_effect
 from lab.foreign_bags import hannes, hannes_in_one_line, signals_of_set, write_bag, write_set
 
@@ -73,6 +73,31 @@ def test_the_error_of_each_condition_is_a_table_of_its_own(
     last = [f"{k + 1.5:.3g}" for k in range(count)]
     shown = {1: [], 3: [["+ glove_stiffness", *last]], 9: [["+ glove_stiffness", "9.5", names[-1]]]}
     assert cells == shown[count]
+
+
+def test_brackets_in_the_name_of_a_condition_are_brackets(capsys: pytest.CaptureFixture[str]) -> None:
+    falls = [Fall("nominal, as given", 1.0, 1.0, {"0 to 5 [mm]": 1.0, "a[/b]": 2.0}, (), {}, 1.6)]
+    _show_conditions(falls)
+    said = capsys.readouterr().out
+    assert "0 to 5 [mm]" in said and "a[/b]" in said
+
+
+@pytest.mark.parametrize(
+    ("errors", "said"),
+    [
+        ({"slow": 1.0, "fast": 1.2, "grasp": 5.0}, "'grasp' is foretold much worse (5.0 times"),
+        ({"slow": 1.0, "fast": 50.0}, "the other conditions (at most 1.0)"),
+        ({"slow": 1.0, "fast": 2.4}, ""),
+        ({"slow": 3.0, "fast": 5.0, "grasp": 4.0}, ""),
+        ({"slow": 4.0}, ""),
+        ({"slow": math.nan, "fast": math.nan}, ""),
+    ],
+)
+def test_a_condition_that_is_foretold_much_worse_than_the_others_is_pointed_at(
+    errors: dict[str, float], said: str
+) -> None:
+    notes = condition_apart([Fall("nominal, fitted", 1.0, 1.0, errors, (), {}, math.nan)])
+    assert len(notes) == bool(said) and all(said in note for note in notes)
 
 
 @pytest.mark.slow

@@ -127,8 +127,8 @@ def test_what_brakes_at_a_place_both_ways_is_told_though_its_mean_there_is_nothi
     curve = shares["friction_by_position"]
     assert curve.centres[int(np.argmax(curve.curve))] == pytest.approx(0.6, abs=0.08)
     assert max(curve.curve) > 0.12 and "friction by position (0." in curve.said
-    assert "either way, most at 0." in pointed_at([curve])
-    assert pointed_at([replace(curve, at=curve.centres[0])]) == "", "there it turns"
+    assert "either way, most at 0." in pointed_at([curve], ["drive_force"])
+    assert pointed_at([replace(curve, at=curve.centres[0])], ["drive_force"]) == "", "there it turns"
 
 
 @pytest.mark.parametrize(("slope", "words"), [(0.3, "the more the larger"), (-0.3, "the less the larger")])
@@ -140,7 +140,11 @@ def test_what_brakes_the_more_the_farther_it_is_is_told_as_that(slope: float, wo
     climbs = np.sign(velocity) * slope * (position - 0.5)
     states = {"position": [position[None]], "velocity": [velocity[None]], "direction": [velocity[None]]}
     found = _dependences({"motor_current": [climbs[None]]}, states, "motor_current", [0.01])
-    assert words in pointed_at(found) and "along the way" in pointed_at(found)
+    said = pointed_at(found, ["motor_current"])
+    assert words in said and "along the way" in said
+    # where no force is recorded it is the position that falls behind what brakes it
+    lag = _dependences({"encoder_position": [-climbs[None]]}, states, "encoder_position", [0.01])
+    assert pointed_at(lag, ["motor_current"]) == said.replace("motor_current", "encoder_position")
 
 
 def test_what_swings_at_one_frequency_whatever_the_speed_is_told_from_a_ripple_along_the_way() -> None:
@@ -164,9 +168,9 @@ def test_what_swings_at_one_frequency_whatever_the_speed_is_told_from_a_ripple_a
     (swung,) = _oscillation("motor_current", swinging, steps)
     assert swung.share > 0.5 and swung.at == pytest.approx(5.7, rel=0.06)
     assert swung.centres[int(np.argmax(swung.curve))] == pytest.approx(5.7, rel=0.15)
-    assert "oscillates at 5." in pointed_at([swung]) and swung.to_dict()["at"] == swung.at
+    assert "oscillates at 5." in pointed_at([swung], ["motor_current"]) and swung.to_dict()["at"] == swung.at
     (rippled,) = _oscillation("motor_current", along, steps)
-    assert rippled.share < 0.05 and pointed_at([rippled]) == ""
+    assert rippled.share < 0.05 and pointed_at([rippled], ["motor_current"]) == ""
     assert all(d.share < 0.2 for d in _oscillation("motor_current", noise, steps))
     assert _oscillation("motor_current", [c[:, :10] for c in swinging], steps) == []
     assert _oscillation("motor_current", swinging[:1], steps[:1]) == [], "one speed cannot tell"

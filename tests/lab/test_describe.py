@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import pytest
-from hannes_bags.reading import read_bag
 from lab.foreign_bags import hannes, signals_of_set, write_set
 
 
@@ -33,7 +32,7 @@ def test_what_is_said_is_what_the_lab_takes(
     sensors = {"current_rectified": True, "current_window": 0.03}
     code, out, _ = run(
         "describe", str(bags / "slow"), "--say", "object=", "--say", f"sensors={json.dumps(sensors)}",
-        "--say", "condition=7", "--json",
+        "--say", "condition= 7 ", "--json",
     )  # fmt: skip
     content = {"condition": "7", "control_period": 0.002, "reference_held": True, "sensors": sensors}
     assert code == 0 and json.loads(out) == {str(bags / "slow"): content}
@@ -48,8 +47,11 @@ def test_what_is_said_is_what_the_lab_takes(
         (["control_period=fast"], "its `control_period` is 'fast'"),
         (["objekt=none"], "nothing called 'objekt' in a recording's metadata; valid are condition, object,"),
         (["object=ball"], "Unknown object 'ball'; valid are none, soft, rigid"),
-        (['object={"size": "big"}'], "is not understood"),
-        (['object={"place": 3}'], "is not understood"),
+        (['object={"size": "big"}'], "{'size': 'big'} is not understood"),
+        (['object={"place": 3}'], "{'place': 3} is not understood"),
+        (['object={"size": -1}'], "Object size is -1; it must be a finite number above 0"),
+        (['object={"shape": "cube"}'], "Object shape 'cube' is unknown; valid are"),
+        (["plant=Reduced"], "its `plant` is 'Reduced'; did you mean reduced?"),
         (["sensors=thesis"], "they must be a mapping"),
         (['sensors={"current_window": -1}'], "must be finite and at least 0"),
         (["reference_held=yes"], "it must be true"),
@@ -64,7 +66,8 @@ def test_a_mistake_is_one_line_and_changes_nothing(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    before = {path: path.read_bytes() for path in bags.rglob("*") if path.is_file()}
     given = [part for word in words for part in ("--say", word)]
     code, out, err = hannes("describe", str(bags), *given, capsys=capsys, monkeypatch=monkeypatch)
     assert code == 2 and out == "" and mistake in err and err.count("\n") == 1
-    assert "object" not in read_bag(bags / "slow").metadata
+    assert before == {path: path.read_bytes() for path in bags.rglob("*") if path.is_file()}

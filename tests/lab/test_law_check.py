@@ -7,15 +7,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hannes_description.control_ports import C_PERIOD, C_POSITION, C_REFERENCE, C_VELOCITY
 from hannes_description.model import Model
+from hannes_lab.join import join_trials
 from hannes_lab.law_check import law_notes
 from hannes_lab.prepare import prepare
 from hannes_lab.rig import PlantRig, load_rig
 from hannes_lab.trials import Closure, Trial, find_moves
 from hannes_sim.factory import make_plant
+from hannes_sim.native import CONTROL_SIGNATURE
 from hannes_sim.rollout import rollout
 from lab.single_mass_rig import Law, reference, write_files
+from numba import cfunc
 
+
+def integrating(x, p, s):  # type: ignore[no-untyped-def]
+    s[0] += 40.0 * x[C_PERIOD] * p[0] * (x[C_REFERENCE] - x[C_POSITION])
+    return p[0] * (x[C_REFERENCE] - x[C_POSITION]) - p[1] * x[C_VELOCITY] + s[0]
+
+
+INTEGRATING = cfunc(CONTROL_SIGNATURE)(integrating)
 ADAPTER = f"{Path(__file__).parent / 'single_mass_rig.py'}:SingleMass"
 
 
@@ -92,6 +103,38 @@ def test_a_command_that_stands_a_row_off_is_said(
     time, force = trial.signals["drive_force"]
     (said,) = law_notes(rig([with_signals(trial, drive_force=(time, np.roll(force, shift)))]), model)
     assert f"the recorded drive_force is what the control law gives for the row {row} it" in said
+
+
+def test_a_law_that_integrates_begins_anew_with_each_file_that_does(
+    machine: tuple[type[PlantRig], Model, Trial],
+) -> None:
+    """Files that end with something left in the integral, one after the other in one trial."""
+    rig, model, _ = machine
+
+    class Integrating(Law):
+        def __init__(self, parameters: object, period: float) -> None:
+            super().__init__(parameters, period)
+            self.address, self.states = INTEGRATING.address, np.zeros(1)
+
+    axis = type("Axis", (rig,), {"controller": lambda self, model, period: Integrating(None, period)})
+    path = np.concatenate(
+        [np.zeros(100), 0.05 * np.sin(np.linspace(0.0, 0.5 * np.pi, 800)) ** 2, np.full(300, 0.05)]
+    )
+    run = rollout(make_plant(model), axis([]).controller(model, 1e-3), path)
+    files = []
+    for k in range(5):
+        signals = {
+            "encoder_position": (run.time, run.encoder_position),
+            "drive_force": (run.time, run.motor_voltage),
+        }
+        closure = Closure(0.0, float(run.time[-1]), "push")
+        units = {"drive_force": "N", "encoder_position": "m"}
+        files.append(Trial(f"push{k}", 1e-3, path, signals, (closure,), units=units, fresh=True))
+    (joined,) = join_trials(files)
+    assert joined.anew
+    assert law_notes(axis([files[0]]), model) == law_notes(axis([joined]), model) == []
+    (said,) = law_notes(rig([joined]), model)
+    assert "are its form, its gains" in said
 
 
 def test_a_log_that_is_slower_than_the_loop_cannot_tell(

@@ -254,6 +254,26 @@ def test_a_recording_that_differs_from_many_of_its_condition_is_left_out(rig: ty
         assert len(joined.closures) == 6 and "stuck" not in {part.name for part in joined.parts}
         (note,) = (note for note in joined.notes if "left out" in note)
         assert "stuck of condition 'push', unlike its 6 other closures: encoder_position differs by" in note
-    half = [replace(stuck, name=f"stuck{k}") for k in range(4)]
+    half = [replace(stuck, name=f"stuck{k}") for k in range(3)]
     apart = join_trials([*half, *good])
-    assert sorted(len(trial.closures) for trial in apart) == [4, 7]
+    assert sorted(len(trial.closures) for trial in apart) == [3, 7]
+    assert any("of one condition, 'push', and are not taken together" in note for note in apart[0].notes)
+    # each stuck in another place: none of them alone is many, and all together are
+    several = [
+        replace(
+            good[0],
+            name=f"stuck{k}",
+            signals={**good[0].signals, "encoder_position": (time, (0.1 + 0.25 * k) * position)},
+        )
+        for k in range(3)
+    ]
+    assert sum(len(trial.closures) for trial in join_trials([*several, *good])) == 10
+
+
+def test_what_holds_another_object_is_no_stray(rig: type) -> None:
+    """Recordings of the same motion, of which one says that it held something else."""
+    soft = [replace(one, options={"object": "soft"}) for one in moves(rig, "push", 0.1, 0.0, 6, fresh=True)]
+    other = replace(soft[0], name="other", options={"object": "rigid"})
+    joined = join_trials([*soft[1:], other])
+    assert sorted(len(trial.closures) for trial in joined) == [1, 5]
+    assert not any("left out" in note for note in joined[0].notes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,8 +30,13 @@ def describe(paths: Sequence[str | Path], entries: Mapping[str, Any]) -> list[Pa
         information = _information(Path(given))
         there = information.get("custom_data")
         custom = {**(there if isinstance(there, Mapping) else {}), **encode_entries(entries)}
-        content = {"rosbag2_bagfile_information": {**information, "custom_data": custom}}
-        written[_file(Path(given))] = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+        file = _file(Path(given))
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+        content["rosbag2_bagfile_information"] = {**information, "custom_data": custom}
+        written[file] = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    for file in written:
+        if not os.access(file.parent, os.W_OK):
+            raise HannesError(f"Cannot write {file}: nothing can be written into its folder.")
     try:
         write_all(dict(written))
     except OSError as error:

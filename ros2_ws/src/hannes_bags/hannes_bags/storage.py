@@ -233,7 +233,8 @@ def load_metadata(path: Path) -> dict[str, Any]:
         raise HannesError(f"{path} has {size} bytes; more than {_METADATA_BYTES} are not read.")
     try:
         # The C loader of libyaml overflows the stack on deep nesting; this one raises RecursionError.
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        content = yaml.safe_load(text)
     except (
         yaml.YAMLError,
         ValueError,
@@ -253,6 +254,14 @@ def load_metadata(path: Path) -> dict[str, Any]:
     version = information.get("version")
     if isinstance(version, bool) or not isinstance(version, int) or not 1 <= version <= 9:
         raise HannesError(f"{path}: version is {version!r}; readable versions: 1 to 9.")
+    if isinstance(said := information.get("custom_data"), dict):
+        # A recorder writes its texts as they are: 007, yes and 12:30:00 are no numbers and no truth.
+        # The loader makes nothing but texts, lists and mappings.
+        plain = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506
+        plain = plain["rosbag2_bagfile_information"]["custom_data"]
+        information["custom_data"] = {
+            key: word if isinstance(word, str) else said.get(key, word) for key, word in plain.items()
+        }
     return information
 
 

@@ -10,7 +10,6 @@ from typing import Any
 
 from rich.cells import cell_len
 from rich.console import Console
-from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
@@ -59,8 +58,10 @@ def estimate(value: float, low: float | None, high: float | None, unit: str) -> 
 
 
 def text_console(width: int | None = None) -> Console:
-    """Where text is printed: as wide as the terminal, or TEXT_WIDTH."""
-    return Console(width=width or (None if sys.stdout.isatty() else TEXT_WIDTH), highlight=False)
+    """Where text is printed: as wide as the terminal, or TEXT_WIDTH; brackets in names are brackets."""
+    return Console(
+        width=width or (None if sys.stdout.isatty() else TEXT_WIDTH), highlight=False, markup=False
+    )
 
 
 def show_table(table: Table, whole: int) -> None:
@@ -89,5 +90,5 @@ def print_table(
     for k, (column, width) in enumerate(zip(columns, widths, strict=True)):
         table.add_column(column, justify="right" if k in right else "left", width=width)
     for row in texts:
-        table.add_row(*map(escape, row))
+        table.add_row(*row)
     text_console(max(sum(widths) + GAP * len(columns), len(title))).print(table)

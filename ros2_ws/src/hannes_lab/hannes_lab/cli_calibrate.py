@@ -92,4 +92,4 @@ def _show(found: Calibration) -> None:
             + ", ".join(f"{k.replace('_', ' ')} {number(v, 3)}" for k, v in found.errors.items())
         )
     for text in found.warnings:
-        console.print(f"warning: {text}", style="dim", markup=False)
+        console.print(f"warning: {text}", style="dim")

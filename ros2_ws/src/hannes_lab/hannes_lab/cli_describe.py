@@ -65,7 +65,7 @@ def _entries(say: Sequence[str]) -> dict[str, Any]:
 
 def _value(key: str, text: str) -> Any:
     if key in NAMES:
-        return text
+        return text.strip()
     try:
         return json_module.loads(text)
     except (ValueError, RecursionError):

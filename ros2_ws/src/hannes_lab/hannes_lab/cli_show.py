@@ -9,6 +9,7 @@ from typing import Any
 from hannes_description.output import TEXT_WIDTH, estimate, number, show_table, text_console, with_unit
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from .add import Addition
 from .compare import Comparison, MetricRow
@@ -79,11 +80,11 @@ def relative_error(row: MetricRow) -> str:
 def show_diagnosis(found: Diagnosis, machine: str) -> None:
     """What is missing from the model of a machine, and how the error falls."""
     console = text_console()
-    console.print(f"[bold]{found.verdict.upper()}[/bold]  {found.summary}")
+    console.print(Text.assemble((found.verdict.upper(), "bold"), f"  {found.summary}"))
     if found.verdict == "unknown" and found.effects:
         console.print(f"\n{NO_FINDING}")
     for effect in found.effects:
-        console.print(f"\n[bold]{effect.title}[/bold] ({effect.name})")
+        console.print(Text.assemble("\n", (effect.title, "bold"), f" ({effect.name})"))
         for name, p in effect.parameters.items():
             note = "" if p.identified else "   not identified by these data"
             value, span = estimate(p.value, p.low, p.high, p.unit)
@@ -215,7 +216,7 @@ def show_addition(found: Addition, machine: str) -> None:
     for effect in found.effects:
         known = {n: estimate(p.value, p.low, p.high, p.unit) for n, p in effect.parameters.items()}
         values = ", ".join(f"{n} = {value} ({span})" for n, (value, span) in known.items())
-        console.print(f"[bold]{effect.title}[/bold]: {values}")
+        console.print(Text.assemble((effect.title, "bold"), f": {values}"))
     _show_falls(console, found, machine)
     for note in found.notes:
         console.print(f"note: {note}", style="dim")

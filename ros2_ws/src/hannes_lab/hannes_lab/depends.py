@@ -157,8 +157,10 @@ def residual_dependences(
     return tuple(sorted(found, key=lambda d: -d.share))
 
 
-def pointed_at(found: Sequence[Dependence]) -> str:
+def pointed_at(found: Sequence[Dependence], drive: Sequence[str]) -> str:
     """A sentence where a residual goes with one frequency, or with a place, as with nothing else; or empty.
+
+    drive   the signals that show force or torque, see Rig
 
     A place counts by what is alike in all passes of it.  Where the way ends the machine turns, and all that has to do
     with starts and stops is largest there.
@@ -181,7 +183,8 @@ def pointed_at(found: Sequence[Dependence]) -> str:
                 "crank, a linkage); examples/effects/position_inertia.py is an effect for it"
             )
         if first.variable == BRAKING and abs(trend := _trend(first)) >= TREND:
-            more, grows = ("more", "grows") if trend > 0.0 else ("less", "falls")
+            # What brakes asks more of the drive; a position that it holds back falls behind.
+            more, grows = ("more", "grows") if (trend > 0.0) == (first.signal in drive) else ("less", "falls")
             return (
                 f"{what} acts against the motion, either way, the {more} the larger the position is: friction that "
                 f"{grows} along the way (a wire that climbs its drum, a guide that tightens, a seal); an effect that "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from difflib import get_close_matches
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -83,6 +84,18 @@ def _name(key: str) -> Callable[[Mapping[str, Any], str], None]:
     return check
 
 
+def _plant(metadata: Mapping[str, Any], source: str) -> None:
+    """Of this project's, or the name of another simulator: one that is meant as the first and is none is refused."""
+    from hannes_sim.factory import PLANTS
+
+    _name("plant")(metadata, source)
+    given = metadata["plant"].strip()
+    if near := [
+        name for name in PLANTS if name != given and get_close_matches(given.lower(), [name], 1, 0.8)
+    ]:
+        raise HannesError(f"{source}: its `plant` is '{given}'; did you mean {near[0]}?")
+
+
 ENTRIES: Mapping[str, Callable[[Mapping[str, Any], str], object]] = MappingProxyType(
     {
         "condition": _name("condition"),
@@ -90,7 +103,7 @@ ENTRIES: Mapping[str, Callable[[Mapping[str, Any], str], object]] = MappingProxy
         "sensors": loggers_of,
         "reference_held": hold_rate,
         "control_period": control_period,
-        "plant": _name("plant"),
+        "plant": _plant,
     }
 )
 """The entries that the lab reads, each with what raises HannesError where a value will not do."""

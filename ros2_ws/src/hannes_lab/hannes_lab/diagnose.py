@@ -162,7 +162,7 @@ def diagnose(
         prepared.features.closures(prepared.rig, best.fit.model, best.fit.values),
         prepared.rig.drive_signals,
     )
-    pointer = pointed_at(depends_on) if unknown else ""
+    pointer = pointed_at(depends_on, prepared.rig.drive_signals) if unknown else ""
     experiments = separating_experiments(prepared, [search.fit_of(n) for n in tied]) if len(tied) > 1 else ()
     return Diagnosis(
         verdict=verdict,

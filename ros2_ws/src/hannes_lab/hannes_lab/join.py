@@ -34,7 +34,7 @@ LARGE = 1e-3
 by more than this part of its span."""
 
 STRAY = 3
-"""Times as many closures of a condition that agree with one another, ENOUGH of them, than some that do not: those are
+"""Times as many closures of a condition that agree with one another, ENOUGH of them, as all that do not: those are
 left out."""
 
 SHORT = 0.8
@@ -99,7 +99,7 @@ def join_trials(trials: Sequence[Trial]) -> list[Trial]:
     joined = _joined_groups(groups)
     apart: dict[str, list[Trial]] = {}
     for trial in joined:
-        if len(trial.conditions) == 1 and len(trial.closures) < ENOUGH:
+        if len(trial.conditions) == 1 and (trial.parts or len(trial.closures) < ENOUGH):
             apart.setdefault(trial.conditions[0], []).append(trial)
     said = [
         f"{', '.join(t.name for t in of_one)} are of one condition, '{condition}', and are not taken together: "
@@ -121,10 +121,9 @@ def _without_strays(groups: Sequence[list[Loaded]]) -> tuple[list[list[Loaded]],
     for group in groups:
         others = [g for g in groups if g is not group and g[0].kind == group[0].kind]
         many = max(others, key=_closures, default=[])
-        if not (
-            _closures(many) >= max(ENOUGH, STRAY * _closures(group))
-            and not _unlike(many[0], group[0], math.inf)
-        ):
+        apart = _closures(group) + sum(_closures(g) for g in others if g is not many)
+        agree = _closures(many) >= max(ENOUGH, STRAY * apart)
+        if not (agree and _one_object([*many, *group]) and not _unlike(many[0], group[0], math.inf)):
             kept.append(group)
             continue
         names = ", ".join(one.trial.name for one in group)

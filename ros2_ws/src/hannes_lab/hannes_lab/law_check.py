@@ -7,11 +7,14 @@ can be asked alone, without a plant.
 
 from __future__ import annotations
 
+import itertools
+from typing import NamedTuple
+
 import numpy as np
 from hannes_description.model import Model
 from hannes_sim.plant import PlantDiverged
 from hannes_sim.raised import watched
-from hannes_sim.rollout import Controller, Rollout
+from hannes_sim.rollout import Controller
 from numpy.typing import NDArray
 
 from .own_law import replay
@@ -28,11 +31,17 @@ SMOOTHED = 9
 LONGEST = 60000
 """Ticks that are looked at."""
 
+FEWEST = 200
+"""Ticks of a simulation that shows which signal is which."""
+
 EVERY_TICK = 1.01
 """Periods between two samples at most, in the median."""
 
 SHIFTS = (0, 1, -1)
 """Ticks by which a log may show a command later, or earlier, than it acted."""
+
+NEARER = 0.5
+"""Part of the difference without a shift that is left with one that is believed."""
 
 
 def law_notes(rig: PlantRig, model: Model) -> list[str]:
@@ -40,74 +49,110 @@ def law_notes(rig: PlantRig, model: Model) -> list[str]:
     found = [off for trial in rig.trials if (off := _off(rig, model, trial)) is not None]
     if not found:
         return []
-    part, shift, signal, name = max(found)
-    if part > OFF:
+    worst = max(found)
+    if worst.part > OFF:
         return [
-            f"fed with the recorded reference and position alone, the control law gives a {signal} that differs from "
-            f"the recorded one by {100.0 * part:.0f} % of its standard deviation ({name}): are its form, its gains and "
-            "their units those of this machine, and is the recorded position what it reads?"
+            f"fed with the recorded reference and position alone, the control law gives a {worst.signal} that differs "
+            f"from the recorded one by {100.0 * worst.part:.0f} % of its standard deviation ({worst.trial}): are its "
+            "form, its gains and their units those of this machine, and is the recorded position what it reads?"
         ]
-    if shift and all(one[1] == shift for one in found):
-        row = "before" if shift > 0 else "after"
+    if worst.shift and all(one.shift == worst.shift for one in found):
+        row = "before" if worst.shift > 0 else "after"
         return [
-            f"the recorded {signal} is what the control law gives for the row {row} it: a log often holds the command "
-            "of another tick than the position beside it; stamp it with the time from which it acts"
+            f"the recorded {worst.signal} is what the control law gives for the row {row} it: where the log is late, "
+            "stamp it with the time of that row; where the command itself acts as late as it is logged, that is "
+            "command_delay"
         ]
     return []
 
 
-def _off(rig: PlantRig, model: Model, trial: Trial) -> tuple[float, int, str, str] | None:
-    """How far the law's answer is off, at which shift, of which signal and trial; None where it cannot be asked."""
-    reference = trial.reference[:LONGEST]
-    try:
-        run = rig.run(model, {}, trial, reference)
-    except PlantDiverged:
-        return None
-    told = rig.logged(run, trial)
+class _Off(NamedTuple):
+    """How far a law is off: part of the command's standard deviation, at which shift, of which signal and trial."""
 
-    def recorded(as_simulated: Array) -> tuple[str, Array] | None:
-        """Name and values on the ticks of the signal that is logged as the simulation has it."""
-        for name, values in told.items():
-            if name in trial.signals and np.array_equal(values, as_simulated):
-                time, measured = trial.signals[name]
-                if time.size > 1 and np.median(np.diff(time)) <= EVERY_TICK * trial.period:
-                    return name, np.interp(run.time, time, measured)
-        return None
+    part: float
+    shift: int
+    signal: str
+    trial: str
 
-    command, position = recorded(run.motor_voltage), recorded(run.encoder_position)
-    if command is None or position is None or np.array_equal(run.motor_voltage, run.encoder_position):
+
+def _off(rig: PlantRig, model: Model, trial: Trial) -> _Off | None:
+    """How far the law's answers are off in a trial; None where it cannot be asked."""
+    named = _named(rig, model, trial)
+    command, position = named.get("motor_voltage"), named.get("encoder_position")
+    if command is None or position is None or command == position:
         return None
     law = rig.controller(model, trial.period)
-    current = recorded(run.motor_current)
-    answers = _answers(law, run, position[1], current[1] if current else np.zeros(run.time.size))
-    if current is None and not np.array_equal(
-        answers, _answers(law, run, position[1], np.ones(run.time.size))
-    ):
-        return None  # it reads a current that nobody recorded
-    name, measured = command
-    size = float(np.std(_smooth(measured)))
-    if size == 0.0 or not np.isfinite(answers).all():
+    stretches = _stretches(trial)
+    current = named.get("motor_current")
+    answers = [_answers(law, trial, own, position, current) for own in stretches]
+    if current is None:
+        others = [_answers(law, trial, own, position, current, 1.0) for own in stretches]
+        if not all(np.array_equal(a, b) for a, b in zip(answers, others, strict=True)):
+            return None  # it reads a current that nobody recorded
+    measured = [_on_ticks(trial, command, own) for own in stretches]
+    size = float(np.std(np.concatenate([_smooth(m) for m in measured])))
+    if size == 0.0 or not all(np.isfinite(a).all() for a in answers):
         return None
-    parts = [(_difference(answers, measured, shift) / size, shift) for shift in SHIFTS]
-    best = min(parts, key=lambda one: (one[0], abs(one[1])))
-    plain = parts[0]
-    return (*(best if best[0] < 0.5 * plain[0] else plain), name, trial.name)
+    pairs = list(zip(answers, measured, strict=True))
+    parts = {
+        shift: float(np.std(np.concatenate([_difference(*pair, shift) for pair in pairs]))) / size
+        for shift in SHIFTS
+    }
+    best = min(SHIFTS, key=parts.__getitem__)
+    shift = best if parts[best] < NEARER * parts[0] else 0
+    return _Off(parts[shift], shift, command, trial.name)
 
 
-def _answers(law: Controller, run: Rollout, position: Array, current: Array) -> Array:
+def _named(rig: PlantRig, model: Model, trial: Trial) -> dict[str, str]:
+    """Signals that are logged at every tick as the simulation has them, by what they are there."""
+    first = max(FEWEST, round(trial.closures[0].stop / trial.period))
+    try:
+        run = rig.run(model, {}, trial, trial.reference[:first])
+    except PlantDiverged:
+        return {}
+    told = rig.logged(run, trial)
+    return {
+        what: name
+        for what in ("motor_voltage", "encoder_position", "motor_current")
+        for name, values in told.items()
+        if name in trial.signals
+        and np.array_equal(values, getattr(run, what))
+        and trial.signals[name][0].size > 1
+        and np.median(np.diff(trial.signals[name][0])) <= EVERY_TICK * trial.period
+    }
+
+
+def _stretches(trial: Trial) -> list[slice]:
+    """Ticks over which the law goes on by itself: the parts of a trial that begin anew, or all of it."""
+    ends = [round(part.begin / trial.period) for part in trial.parts[1:]] if trial.anew else []
+    edges = [0, *ends, trial.reference.size]
+    out = [slice(a, min(b, LONGEST)) for a, b in itertools.pairwise(edges) if a + FEWEST < LONGEST]
+    return [own for own in out if own.stop - own.start > 2 * SMOOTHED]
+
+
+def _on_ticks(trial: Trial, signal: str, own: slice) -> Array:
+    time, values = trial.signals[signal]
+    out: Array = np.interp(np.arange(own.start, own.stop) * trial.period, time, values)
+    return out
+
+
+def _answers(
+    law: Controller, trial: Trial, own: slice, position: str, current: str | None, instead: float = 0.0
+) -> Array:
+    """Commands of the law along a stretch; instead: the current where none is recorded."""
     law.reset()
-    velocity = np.diff(position, prepend=position[0]) / law.period
-    given = np.column_stack([run.reference_position, position, velocity, current])
+    place = _on_ticks(trial, position, own)
+    velocity = np.diff(place, prepend=place[0]) / law.period
+    amperes = _on_ticks(trial, current, own) if current else np.full(place.size, instead)
     with watched():
-        return replay(law, given)
+        return replay(law, np.column_stack([trial.reference[own], place, velocity, amperes]))
 
 
-def _difference(answers: Array, measured: Array, shift: int) -> float:
-    """Standard deviation of the difference where the command is logged `shift` ticks after its answer."""
+def _difference(answers: Array, measured: Array, shift: int) -> Array:
+    """What a command that is logged `shift` ticks after its answer differs by from it."""
     n = answers.size - abs(shift)
-    a = answers[max(-shift, 0) : max(-shift, 0) + n]
-    m = measured[max(shift, 0) : max(shift, 0) + n]
-    return float(np.std(_smooth(m - a)))
+    a, m = max(-shift, 0), max(shift, 0)
+    return _smooth(measured[m : m + n] - answers[a : a + n])
 
 
 def _smooth(values: Array) -> Array:

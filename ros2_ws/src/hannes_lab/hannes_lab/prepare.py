@@ -318,7 +318,8 @@ def _drifts_together(features: Features, advice: str) -> list[str]:
     curves: dict[str, list[NDArray[np.float64]]] = {}
     for block in features.blocks:
         # Of recordings that begin anew the most typical one stands first, the others in their order.
-        first = 1 if features.trials[block.trial].fresh and features.trials[block.trial].parts else 0
+        trial = features.trials[block.trial]
+        first = sum(c.start < trial.parts[1].begin for c in trial.closures) if trial.anew else 0
         curves.setdefault(block.signal, []).append(block.measured[first:])
     shares = {signal: drift_together(own) for signal, own in curves.items() if len(own) > 1}
     said = ", ".join(f"{100.0 * share:.0f} % of the scatter of {s}" for s, share in shares.items() if share)

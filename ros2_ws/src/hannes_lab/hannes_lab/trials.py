@@ -301,6 +301,9 @@ class Trial:
         return replace(self, closures=tuple(closures))
 
 
+OR_ELSE = "(if that is wrong: `hannes describe BAG --say reference_held=true`, or false)"
+
+
 def reference_on_grid(
     time: Array, values: Array, period: float, duration: float, hold_rate: float = ZERO_ORDER_HOLD_RATE
 ) -> tuple[Array, str | None]:
@@ -582,11 +585,8 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     }
     logged = samples.pop("reference_position")
     reference, note = reference_on_grid(*logged, period, duration, hold_rate(meta, recording.source))
-    if note and "reference_held" not in meta:
-        other = "false" if "held" in note else "true"
-        note += f" (if that is wrong: `hannes describe BAG --say reference_held={other}`)"
     if note:
-        notes.append(note)
+        notes.append(note if "reference_held" in meta else f"{note} {OR_ELSE}")
     begin = max(float(t[0]) for t, _ in samples.values())
     end = min(float(t[-1]) for t, _ in samples.values())
     spans = find_closures(reference, period)

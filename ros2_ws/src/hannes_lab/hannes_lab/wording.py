@@ -199,22 +199,22 @@ def worse_fitted(falls: Sequence[Fall]) -> tuple[str, ...]:
     )
 
 
-APART = 2.0
-"""Multiples of the repeatability, and of the error of all conditions together, from which one that was left out of the
-fit is worth a note."""
+APART, THAN_OTHERS = 2.5, 2.0
+"""Multiples of its repeatability, and of what the worst of the others is missed by, from which a condition that was
+left out of the fit is worth a note."""
 
 
 def condition_apart(falls: Sequence[Fall]) -> tuple[str, ...]:
-    """A sentence on the condition that is foretold much worse than the others together, if there is one."""
-    last = falls[-1]
-    known = {name: error for name, error in last.by_condition.items() if np.isfinite(error)}
+    """A sentence on the condition that is foretold much worse than the others, if there is one."""
+    known = {name: error for name, error in falls[-1].by_condition.items() if np.isfinite(error)}
     worst = max(known, key=known.__getitem__, default="")
-    if len(known) < 2 or known[worst] < APART * max(1.0, last.held_out_conditions):
+    others = [error for name, error in known.items() if name != worst]
+    if not others or known[worst] < max(APART, THAN_OTHERS * max(others)):
         return ()
     return (
-        f"'{worst}' is missed by {known[worst]:.2f} times its repeatability when it takes no part in the fit, all "
-        f"conditions together by {last.held_out_conditions:.2f}: something may act there that the others do not show, "
-        "or nothing else shows what acts there",
+        f"'{worst}' is foretold much worse ({known[worst]:.1f} times its repeatability) than the other conditions (at "
+        f"most {max(others):.1f}) when it takes no part in the fit: either something acts there only, or it alone "
+        "shows what acts",
     )
 
 

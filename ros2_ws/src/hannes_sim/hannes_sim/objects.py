@@ -68,6 +68,8 @@ class GraspObject:
             if "place" in values:
                 values["place"] = tuple(float(c) for c in values["place"])
             return cls(**values)
+        except HannesError:
+            raise
         except (TypeError, ValueError):
             raise HannesError(
                 f"Object: {values} is not understood; shape is a word, place three numbers in m, all else a number."

@@ -226,7 +226,7 @@ def _show(sections: list[Section], rows: list[str] | None) -> None:
         ]
         print_table(section.title, HEADINGS, shown, right=range(3, 8))
         for note in section.notes:
-            console.print(f"note: {note}", style="dim", markup=False)
+            console.print(f"note: {note}", style="dim")
 
 
 def _expand(row: str) -> tuple[str, ...]:
