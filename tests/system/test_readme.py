@@ -97,7 +97,8 @@ def test_own_effect_works_as_pasted(user: Path) -> None:
     )
     printed = run(quick, user)
     assert "Missing: worn spot." in printed
-    rows = re.findall(r"\+ worn_spot\s+│\s+([\d.]+)\s+│\s+([\d.]+)", printed)
+    of_all = re.sub(r"Of each condition.*?└", "", printed, flags=re.DOTALL)
+    rows = re.findall(r"\+ worn_spot\s+│\s+([\d.]+)\s+│\s+([\d.]+)", of_all)
     assert len(rows) == 2  # of diagnose and of add
     assert all(float(held_out) < 1.3 for _, held_out in rows), printed
     assert "my_effect.py:WornSpot" in (user / "lab" / "worn_hand.yaml").read_text(encoding="utf-8")
