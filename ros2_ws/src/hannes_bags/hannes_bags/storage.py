@@ -226,6 +226,13 @@ def _refuse_wal(file: Path) -> None:
         )
 
 
+class _Texts(yaml.SafeLoader):
+    """Texts as they stand, whatever they look like."""
+
+
+_Texts.yaml_implicit_resolvers = {}
+
+
 def load_metadata(path: Path) -> dict[str, Any]:
     """The content of a metadata.yaml below rosbag2_bagfile_information."""
     size = path.stat().st_size
@@ -256,9 +263,7 @@ def load_metadata(path: Path) -> dict[str, Any]:
         raise HannesError(f"{path}: version is {version!r}; readable versions: 1 to 9.")
     if isinstance(said := information.get("custom_data"), dict):
         # A recorder writes its texts as they are: 007, yes and 12:30:00 are no numbers and no truth.
-        # The loader makes nothing but texts, lists and mappings.
-        plain = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506
-        plain = plain["rosbag2_bagfile_information"]["custom_data"]
+        plain = _Texts(text).get_single_data()["rosbag2_bagfile_information"]["custom_data"]
         information["custom_data"] = {
             key: word if isinstance(word, str) else said.get(key, word) for key, word in plain.items()
         }
