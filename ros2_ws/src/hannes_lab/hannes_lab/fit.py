@@ -449,11 +449,12 @@ def fit(
             r = residual_at(z)
     if complete:
         forces = Forces(coordinates, z, scaling(problem, model))
-        whole = forces.likeliest(priors)
+        whole, least = forces.likeliest(priors), max(LEAST_GAIN, little * (cost(r, z) - samples))
         for part in FACTOR_PARTS:
             other = np.clip(forces.scaled(part * whole), bounds[0] + edge, bounds[1] - edge)
-            # Only where the priors alone would gain by it is it worth a simulation.
-            if (priors * z) @ (priors * z) - (priors * other) @ (priors * other) <= LEAST_GAIN:
+            # Only where the priors alone would gain enough by it is it worth a simulation: where much is left
+            # unexplained the cost is rough by more than that.
+            if (priors * z) @ (priors * z) - (priors * other) @ (priors * other) <= least:
                 break
             there = residual_at(other)
             if cost(there, other) < cost(r, z):
