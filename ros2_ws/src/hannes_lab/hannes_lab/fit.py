@@ -449,15 +449,15 @@ def fit(
             r = residual_at(z)
     if complete:
         forces = Forces(coordinates, z, scaling(problem, model))
-        whole, least = forces.likeliest(priors), max(LEAST_GAIN, little * (cost(r, z) - samples))
+        whole = forces.likeliest(priors)
         for part in FACTOR_PARTS:
             other = np.clip(forces.scaled(part * whole), bounds[0] + edge, bounds[1] - edge)
-            # Only where the priors alone would gain enough by it is it worth a simulation: where much is left
-            # unexplained the cost is rough by more than that.
-            if (priors * z) @ (priors * z) - (priors * other) @ (priors * other) <= least:
+            gain = (priors * z) @ (priors * z) - (priors * other) @ (priors * other)
+            if gain <= LEAST_GAIN:  # not worth a simulation
                 break
+            # What the data tell of it, one way or the other (or by the roughness of a bad fit), is for the search.
             there = residual_at(other)
-            if cost(there, other) < cost(r, z):
+            if abs(there[use] @ there[use] - r[use] @ r[use]) < gain:
                 z, r = other, there
                 break
     if exact and not derivatives.fresh:
