@@ -137,6 +137,17 @@ def test_a_law_that_integrates_begins_anew_with_each_file_that_does(
     assert "are its form, its gains" in said
 
 
+def test_files_that_are_too_short_for_a_mean_are_not_asked(
+    machine: tuple[type[PlantRig], Model, Trial],
+) -> None:
+    rig, model, trial = machine
+    few = slice(0, 12)
+    signals = {name: (time[few], values[few]) for name, (time, values) in trial.signals.items()}
+    closure = Closure(0.0, 0.011, "push")
+    short = replace(trial, reference=trial.reference[few], signals=signals, closures=(closure,))
+    assert law_notes(of_gains(rig, 8.0, 0.6)([short]), model) == []
+
+
 def test_a_log_that_is_slower_than_the_loop_cannot_tell(
     machine: tuple[type[PlantRig], Model, Trial],
 ) -> None:

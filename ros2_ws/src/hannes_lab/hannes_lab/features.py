@@ -205,11 +205,7 @@ class Features:
         They last as long as is needed for a closure of each condition that is not its first, or are whole.
         """
         trial, end = self.trials[number], None if whole else self.ends[number]
-        if end is None and trial.anew:
-            begins = [round(part.begin / trial.period) for part in trial.parts]
-            references = np.split(trial.reference, begins[1:])
-        else:
-            references = [trial.reference[:end]]
+        references = np.split(trial.reference, trial.anew_at) if end is None else [trial.reference[:end]]
         runs = [rig.simulate(model, values, trial, reference) for reference in references]
         for signals, reference in zip(runs, references, strict=True):
             check_simulated(signals, self._wanted[number], trial, reference.size, rig)

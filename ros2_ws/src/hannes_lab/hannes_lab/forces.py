@@ -48,8 +48,8 @@ class Forces:
 
     Where the command is a current or a force, its constant, masses, frictions, weights and ripples are known by the
     motion up to that factor: only priors tell it.  Of a voltage's drive the resistance is too, where no current is
-    recorded.  The derivatives, which the roughness of dry friction blurs, lead a
-    fit a little along this valley, tell it that there it ends, and make it look narrow.
+    recorded.  The derivatives, which the roughness of dry friction blurs, lead a fit a little along this valley, tell
+    it that there it ends, and make it look narrow.
 
     scale  by unit the power with which the factor enters, see scaling
     """

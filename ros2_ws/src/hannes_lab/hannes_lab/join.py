@@ -123,11 +123,11 @@ def _without_strays(groups: Sequence[list[Loaded]]) -> tuple[list[list[Loaded]],
         many = max(others, key=_closures, default=[])
         apart = _closures(group) + sum(_closures(g) for g in others if g is not many)
         agree = _closures(many) >= max(ENOUGH, STRAY * apart)
-        if not (agree and _one_object([*many, *group]) and not _unlike(many[0], group[0], math.inf)):
+        if not (agree and _one_object([*many, *group]) and not _not_comparable(many[0], group[0])):
             kept.append(group)
             continue
         names = ", ".join(one.trial.name for one in group)
-        why = _unlike(many[0], group[0], SAID)
+        why = _too_far(many[0], group[0], SAID)
         said.append(
             f"left out: {names} of condition '{group[0].condition}', unlike its {_closures(many)} other closures: {why}"
         )
@@ -164,10 +164,11 @@ def _why_apart(loaded: Sequence[Loaded]) -> str:
     """Why recordings of one condition do not repeat each other."""
     first = loaded[0]
     for other in loaded[1:]:
-        if unlike := _unlike(first, other, SAID):
-            signals = not _unlike(first, other, math.inf)
-            advice = "; name what differs as a condition of its own, or leave one out" if signals else ""
-            return f"{unlike}{advice} ({first.trial.name}, {other.trial.name})"
+        if unlike := _not_comparable(first, other):
+            return f"{unlike} ({first.trial.name}, {other.trial.name})"
+        if unlike := _too_far(first, other, SAID):
+            advice = "name what differs as a condition of its own, or leave one out"
+            return f"{unlike}; {advice} ({first.trial.name}, {other.trial.name})"
     if first.trial.fresh:
         apart = _joined(loaded, fresh=True).apart
         return (
@@ -267,6 +268,22 @@ def _unlike(one: Loaded, other: Loaded, alike: float) -> str:
 
     alike  most that mean closures may differ by, see ALIKE
     """
+    return _not_comparable(one, other) or _too_far(one, other, alike)
+
+
+def _too_far(one: Loaded, other: Loaded, alike: float) -> str:
+    """By how much a signal of two recordings that could be repeats differs, where that is too much."""
+    far = {signal: _apart(one.trial, other.trial, signal) for signal in one.trial.signals}
+    signal = max(far, key=lambda name: far[name])
+    if far[signal] <= alike:
+        return ""
+    return (
+        f"{signal} differs by {100 * far[signal]:.0f} % of its span, where repeats may by {100 * alike:.0f} %"
+    )
+
+
+def _not_comparable(one: Loaded, other: Loaded) -> str:
+    """Why two recordings cannot repeat each other, whatever was measured; empty if they can."""
     a, b = one.trial, other.trial
     for trial in (a, b):
         if len(trial.conditions) != 1 or len(trial.closures) >= ENOUGH or trial.parts:
@@ -287,13 +304,7 @@ def _unlike(one: Loaded, other: Loaded, alike: float) -> str:
         return f"their options differ ({', '.join(options)})"
     if len(_joined([one, other]).conditions) != 1:
         return f"their references differ{_by(a, b)}"
-    far = {signal: _apart(a, b, signal) for signal in a.signals}
-    signal = max(far, key=lambda name: far[name])
-    if far[signal] <= alike:
-        return ""
-    return (
-        f"{signal} differs by {100 * far[signal]:.0f} % of its span, where repeats may by {100 * alike:.0f} %"
-    )
+    return ""
 
 
 def _by(a: Trial, b: Trial) -> str:

@@ -19,6 +19,7 @@ from hannes_sim.raised import watched
 from hannes_sim.rollout import Controller
 from numpy.typing import NDArray
 
+from .clock import moving_mean
 from .own_law import replay
 from .rig import PlantRig
 from .trials import Trial
@@ -81,10 +82,10 @@ def _off(rig: PlantRig, model: Model, trial: Trial) -> _Off | None:
     """How far the law's answers are off in a trial; None where it cannot be asked."""
     named = _named(rig, model, trial)
     command, position = named.get("motor_voltage"), named.get("encoder_position")
-    if command is None or position is None or command == position:
+    stretches = _stretches(trial)
+    if command is None or position is None or command == position or not stretches:
         return None
     law = rig.controller(model, trial.period)
-    stretches = _stretches(trial)
     current = named.get("motor_current")
     answers = [_answers(law, trial, own, position, current) for own in stretches]
     if current is None:
@@ -128,8 +129,7 @@ def _named(rig: PlantRig, model: Model, trial: Trial) -> dict[str, str]:
 
 def _stretches(trial: Trial) -> list[slice]:
     """Ticks over which the law goes on by itself: the parts of a trial that begin anew, or all of it."""
-    ends = [round(part.begin / trial.period) for part in trial.parts[1:]] if trial.anew else []
-    edges = [0, *ends, trial.reference.size]
+    edges = [0, *trial.anew_at, trial.reference.size]
     out = [slice(a, min(b, LONGEST)) for a, b in itertools.pairwise(edges) if a + FEWEST < LONGEST]
     return [own for own in out if own.stop - own.start > 2 * SMOOTHED]
 
@@ -160,5 +160,4 @@ def _difference(answers: Array, measured: Array, shift: int) -> Array:
 
 
 def _smooth(values: Array) -> Array:
-    out: Array = np.convolve(values, np.full(SMOOTHED, 1.0 / SMOOTHED), mode="valid")
-    return out
+    return moving_mean(values, SMOOTHED)[SMOOTHED - 1 :]

@@ -199,6 +199,11 @@ class Trial:
         return self.fresh and len(self.parts) > 1
 
     @property
+    def anew_at(self) -> list[int]:
+        """Control ticks, after the first, at which it begins anew."""
+        return [round(part.begin / self.period) for part in self.parts[1:]] if self.anew else []
+
+    @property
     def repeats(self) -> tuple[int, ...]:
         """For each closure the number of the one that it repeats, for a machine without memory.
 

@@ -471,8 +471,7 @@ def other_clock(problem: Problem, found: Fit) -> Clock | None:
         f"what is left looks as if the signals were {'later' if delay > 0.0 else 'earlier'} than the reference's clock "
         f"says, by {1e3 * abs(delay):.2g} ms: that alone would remove {100.0 * part:.0f} % of the misfit; mend it "
         f"where the recordings are read, or let it be fitted ({REFERENCE_DELAY} in an adapter's tolerances)"
-        + LATE_COMMAND
-        * (delay > 0.0),
+        + (LATE_COMMAND if delay > 0.0 else ""),
     )
 
 
