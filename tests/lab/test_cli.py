@@ -33,7 +33,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_compare(bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     code, out, _ = hannes("compare", str(bags), capsys=capsys, monkeypatch=monkeypatch)
-    assert code == 0 and "fails" in out and "times the repeatability" in out
+    assert code == 0 and "fails" in out and "times the repeatability" in out and "Nothing is fitted: " in out
     assert "Relative error: (measured - model) / measured." in out
     code, out, _ = hannes("compare", str(bags), "--json", capsys=capsys, monkeypatch=monkeypatch)
     content = json.loads(out)
@@ -50,7 +50,7 @@ def test_trials(bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pyt
     assert signals["motor_current"]["rate"] == pytest.approx(30.0, rel=0.02)
     assert signals["encoder_position"]["highest"] == pytest.approx(12.0, abs=1.5)
     code, out, _ = hannes("trials", str(bags), capsys=capsys, monkeypatch=monkeypatch)
-    assert code == 0 and "motor_current" in out and "control period" in out
+    assert code == 0 and "motor_current" in out and "control period" in out and "e-1" not in out
     code, out, err = hannes("trials", "nowhere", capsys=capsys, monkeypatch=monkeypatch)
     assert code == 2 and "No bag 'nowhere'" in err
 
@@ -193,6 +193,7 @@ def test_hide_keeps_the_truth_away_from_the_bags(
     [
         (("compare", "no/such/bag"), "does not exist"),
         (("diagnose", "BAGS", "--effect", "wire_slak"), "Unknown effect"),
+        (("diagnose", "BAGS", "--effect", "cogging:period"), "is given by its name alone, cogging"),
         (("diagnose", "BAGS", "--only", "glove_stifness"), "did you mean glove_stiffness?"),
         (("compare", "EMPTY", "--rig", "EMPS"), "A folder: '"),
         (("compare", "BROKEN"), "while parsing a flow sequence in"),

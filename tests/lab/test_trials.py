@@ -28,7 +28,12 @@ from hannes_sim.rollout import rollout
 
 
 def recording(
-    reference: np.ndarray, rate: float, *, metadata: dict[str, object] | None = None, wobble: int = -1
+    reference: np.ndarray,
+    rate: float,
+    *,
+    metadata: dict[str, object] | None = None,
+    wobble: int = -1,
+    by: float = 2.0,
 ) -> Recording:
     """Signals that follow the reference with a lag, logged at 30 Hz; closure `wobble` is disturbed."""
     time = np.arange(reference.size) * 1e-3
@@ -37,7 +42,7 @@ def recording(
     position = np.interp(log - 0.05, time, reference)
     if wobble >= 0:
         start = 4.0 * wobble
-        position += np.where((log > start) & (log < start + 2.0), 2.0, 0.0)
+        position += np.where((log > start) & (log < start + 2.0), by, 0.0)
     rng = np.random.default_rng(0)
     position = position + 1e-3 * rng.standard_normal(log.size)
     channels = {
@@ -306,6 +311,19 @@ def test_an_outlier_closure_is_left_out() -> None:
     assert len(trial.closures) == 7
     assert not any(abs(c.start - 12.0) < 0.5 for c in trial.closures)
     assert any("left out" in note for note in trial.notes)
+
+
+@pytest.mark.parametrize(("number", "told"), ((0, True), (3, False)))
+def test_a_first_closure_that_is_rather_far_from_the_others_stays_and_is_said(
+    number: int, told: bool
+) -> None:
+    """One that is not the first differs by chance, for all that is known."""
+    trial = make_trial(recording(half_sine(8), 250.0, wobble=number, by=0.07))
+    looked_at = without_outliers(trial)
+    assert looked_at.closures == trial.closures
+    said = [note for note in looked_at.notes if note.startswith("the first closure is 3.")]
+    assert len(said) == told, looked_at.notes
+    assert without_outliers(make_trial(recording(half_sine(8), 250.0))).notes == ()
 
 
 def test_no_closure_and_no_signal_are_clear_errors() -> None:

@@ -220,7 +220,9 @@ def test_bad_inputs_are_said_until_good_ones_come(peer, bad, said, level):
         status = sensors.until(lambda s: said in s["message"], "the rejected input")
         assert status["level"] >= level
         # the voltages and the status are two topics: what was sent before the status may still be on its way
-        peer.until(lambda: (voltages(peer)[-1] == 0.0) is (level == "2"), what="the voltage that goes with it")
+        peer.until(
+            lambda: (voltages(peer)[-1] == 0.0) is (level == "2"), what="the voltage that goes with it"
+        )
         peer.until(lambda: said in node.output, what="the reason in the log")
         sensors.position, sensors.current, sensors.reference = 1.0, 0.1, 5.0
         sensors.until(drives, "all well again")

@@ -18,6 +18,8 @@ from .experiments import VISIBLE, Experiment
 from .falls import NO_REPEATS, errors_in_units, step_name
 from .report_text import NO_FINDING
 
+UNFITTED = "Nothing is fitted: what parameters are off in any machine leaves such a residual too; --fitted fits them."
+
 
 def show_comparison(result: Comparison) -> None:
     """Where a model fails, the figures of the thesis, and what the residual depends on."""
@@ -60,6 +62,8 @@ def show_comparison(result: Comparison) -> None:
         console.print("Relative error: (measured - model) / measured.", style="dim")
     _show_nuisances(result.nuisances)
     console.print("The residual depends on: " + ", ".join(d.said for d in result.depends_on))
+    if result.depends_on and not result.fitted:
+        console.print(UNFITTED, style="dim")
     if math.isfinite(result.overall):
         console.print(f"Overall error: {number(result.overall)} times the repeatability between closures.")
     else:

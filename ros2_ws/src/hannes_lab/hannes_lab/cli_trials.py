@@ -26,7 +26,9 @@ def trials(
 ) -> None:
     """Tell what the lab reads of recordings: conditions, closures, signals with rates, units and ranges.
 
-    Nothing is simulated: a look at what an adapter, or a bag, gives before the first `compare`.
+    Nothing is simulated: a look at what an adapter, or a bag, gives before the first `compare`. The reference is the
+    one that is replayed, a value for each control period, however it was logged. A closure lasts from where it leaves
+    its rest to where it does again, the last one to the end of the recording.
     """
     from .prepare import as_compared, notes_of
     from .session import trials_from
@@ -74,13 +76,15 @@ def told(trial: Trial, unit: str = "") -> dict[str, Any]:
 
 
 def _signal(name: str, unit: str, values: Any, step: float) -> dict[str, Any]:
+    lowest, highest = float(np.min(values)), float(np.max(values))
+    rounding = 1e-12 * (highest - lowest)
     return {
         "name": name,
         "unit": unit,
         "samples": int(values.size),
         "rate": 1.0 / step if step > 0.0 else None,
-        "lowest": float(np.min(values)),
-        "highest": float(np.max(values)),
+        "lowest": lowest if abs(lowest) > rounding else 0.0,
+        "highest": highest if abs(highest) > rounding else 0.0,
     }
 
 

@@ -48,6 +48,10 @@ from .units import in_si
 OUTLIER = 6.0
 """A closure whose distance from the median closure exceeds this multiple of the median distance is left out."""
 
+FIRST_APART = 3.0
+"""The same from which it is said that the first closure of a recording, which stays, is unlike the others: the machine
+began elsewhere, in its slack, its friction or its grease."""
+
 FEW = 5
 """Closures of a condition below which its scatter is no more than guessed, and no test is made (compare.py)."""
 
@@ -144,6 +148,7 @@ def without_outliers(trial: Trial) -> Trial:
     """Leave out closures that are far from the others of their condition (at least five closures needed)."""
     kept: list[Closure] = []
     dropped: list[Closure] = []
+    said: list[str] = []
     for condition in trial.conditions:
         closures = trial.of(condition)
         if len(closures) < 5:
@@ -160,14 +165,23 @@ def without_outliers(trial: Trial) -> Trial:
             # What the others are simulated as stays: the most typical recording of those that begin anew.
             needed = trial.anew and closure.start < trial.parts[1].begin
             (dropped if far > OUTLIER and not needed else kept).append(closure)
+        if closures[0] in kept and distance[0] > FIRST_APART:
+            of = f" of '{condition}'" if len(trial.conditions) > 1 else ""
+            said.append(
+                f"the first closure{of} is {distance[0]:.1f} times as far from the median closure as half of them are: "
+                f"it stays (from {OUTLIER:g} times on it is left out), counts as scatter, and errors look small "
+                "against that"
+            )
     if not dropped:
-        return trial
+        return replace(trial, notes=(*trial.notes, *said)) if said else trial
     several = len(trial.conditions) > 1
     note = f"{len(dropped)} closure(s) far from the others are left out, starting at " + ", ".join(
         f"{max(c.start, 0.0):.1f} s{f' ({c.condition})' if several else ''}{_missing(trial, c)}"
         for c in dropped
     )
-    return replace(trial, closures=tuple(sorted(kept, key=lambda c: c.start)), notes=(*trial.notes, note))
+    return replace(
+        trial, closures=tuple(sorted(kept, key=lambda c: c.start)), notes=(*trial.notes, note, *said)
+    )
 
 
 def _missing(trial: Trial, closure: Closure) -> str:

@@ -547,7 +547,7 @@ def untold(nuisances: Sequence[Nuisance]) -> list[str]:
     names = list(dict.fromkeys(name.partition("@")[0] for name in wide))
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return [
-        f"the recordings do not tell {', '.join(names[:NAMED])}{more}: here they are nominal, --fitted fits them"
+        f"the recordings do not tell {', '.join(names[:NAMED])}{more}: here they are the model's, --fitted fits them"
     ] * bool(names)
 
 

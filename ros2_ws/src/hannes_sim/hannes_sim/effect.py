@@ -233,6 +233,11 @@ def load_effect(name_or_source: str) -> EffectType:
             )
         return found[name_or_source]
     file, _, class_name = name_or_source.rpartition(":")
+    if file in catalogue() and not Path(file).exists():
+        raise HannesError(
+            f"'{name_or_source}': an effect of the catalogue is given by its name alone, {file}; values of its "
+            "parameters stand in a model file (`hannes add` writes one)."
+        )
     effect = load_class(file, class_name, "effect")
     if not (inspect.isclass(effect) and issubclass(effect, Effect)):
         raise HannesError(f"'{class_name}' in '{file}' is not a subclass of hannes_sim.effect.Effect.")
