@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import pty
+import re
 import signal
 import subprocess
 import sys
 from pathlib import Path
-from time import sleep
+from time import monotonic, sleep
 
 import pytest
 import yaml
@@ -280,3 +282,42 @@ def test_ctrl_c_reaches_a_program_that_knows_nothing_of_it() -> None:
     with ProcessGroup(lambda text: None, os.environ) as group:
         group.start("plain", ["sleep", "60"])
         assert group.stop() == {"plain": -signal.SIGINT}
+
+
+PARENT = """
+import sys, time
+from hannes_bringup.processes import Interrupted, ProcessGroup, raise_on_signals
+raise_on_signals()
+with ProcessGroup(lambda text: print(text, flush=True)) as group:
+    try:
+        group.start("child", [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(600)"])
+        while True:
+            print("drives", flush=True)
+            time.sleep(0.02)
+    except Interrupted:
+        pass
+"""
+
+
+@pytest.mark.parametrize("how", ["terminal closed", "killed"])
+def test_no_child_outlives_a_command_whose_terminal_is_closed_or_that_is_killed(how: str) -> None:
+    """The child is a motor controller, which would drive the motor on."""
+    parent, terminal = pty.fork()
+    if parent == 0:
+        os.execv(sys.executable, [sys.executable, "-c", PARENT])
+    said = ""
+    try:
+        while "\nup" not in said:
+            said += os.read(terminal, 4096).decode()
+        found = re.search(r"\[child\] started, pid (\d+)", said)
+        assert found, said
+        if how == "killed":
+            os.kill(parent, signal.SIGKILL)
+    finally:
+        os.close(terminal)
+        os.waitpid(parent, 0)
+    state = Path(f"/proc/{found[1]}/stat")
+    end = monotonic() + PATIENCE
+    while state.exists() and state.read_text().rpartition(")")[2].split()[0] != "Z":
+        assert monotonic() < end, "the child still runs"
+        sleep(0.02)

@@ -39,7 +39,8 @@ def test_signals_end_real_time_nodes_quietly(peer):
     nodes = {name: NodeProcess(name) for name in NODES}
     with processes(*nodes.values()):
         peer.until(lambda: all(peer.status(name) for name in NODES), what="diagnostics of all nodes")
-        for number, node in zip((signal.SIGINT, signal.SIGTERM) * 2, nodes.values(), strict=True):
+        ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGHUP)
+        for number, node in zip(ending, nodes.values(), strict=True):
             node.send(number)
         assert {name: node.wait() for name, node in nodes.items()} == dict.fromkeys(NODES, 0)
     assert not [node.output for node in nodes.values() if "Traceback" in node.output]

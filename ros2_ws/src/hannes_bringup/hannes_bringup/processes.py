@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -21,8 +22,9 @@ POLL = 0.05
 
 QUIET_FROM_THE_START = (
     "import os, signal, sys\n"
-    "for number in (signal.SIGINT, signal.SIGTERM):\n"
-    "    signal.signal(number, lambda *_: os._exit(0))\n"
+    "for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):\n"
+    "    if signal.getsignal(number) != signal.SIG_IGN:\n"
+    "        signal.signal(number, lambda *_: os._exit(0))\n"
     "signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])\n"
 )
 """What the code of `python -c` begins with so that a signal during its imports ends it as quietly as a later one.
@@ -34,7 +36,8 @@ A `ProcessGroup` holds SIGINT back from such a program until then: of its start 
 class ProcessGroup:
     """Processes by name, each in a process group of its own so that Ctrl-C reaches them only through `stop`.
 
-    Use as a context manager: whatever happens inside, no process is left behind.
+    Use as a context manager: whatever happens inside, no process is left behind; where this process is killed, the
+    kernel sends them SIGINT.
     """
 
     say: Callable[[str], None]
@@ -62,6 +65,7 @@ class ProcessGroup:
                 env=None if self.environment is None else dict(self.environment),
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
+                preexec_fn=_end_with_parent,
             )
         except OSError as error:
             raise HannesError(f"Cannot start '{name}' ({command[0]}): {error.strerror}.") from error
@@ -114,17 +118,40 @@ class ProcessGroup:
             return  # it has just ended by itself
 
 
+_PR_SET_PDEATHSIG = 1
+_library = ctypes.CDLL(None)
+
+
+def _end_with_parent() -> None:
+    """In a child, before its program begins: SIGINT when the parent dies (Linux; elsewhere nothing happens)."""
+    if hasattr(_library, "prctl"):
+        _library.prctl(_PR_SET_PDEATHSIG, int(signal.SIGINT), 0, 0, 0)
+
+
 class Interrupted(Exception):
-    """SIGINT or SIGTERM came."""
+    """SIGINT or SIGTERM came, or the terminal was closed."""
 
 
 def raise_on_signals() -> None:
-    """Let SIGINT and SIGTERM raise Interrupted in the main thread, once; further ones are ignored while stopping."""
+    """Let SIGINT, SIGTERM and SIGHUP raise Interrupted in the main thread, once; others are ignored while stopping.
+
+    A SIGHUP that is ignored (`nohup`) stays so.
+    """
+    numbers = [
+        number
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN
+    ]
 
     def handler(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        for each in numbers:
+            signal.signal(each, signal.SIG_IGN)
+        if number == signal.SIGHUP:
+            # Nobody reads any more, and a write to a closed terminal is an error in the midst of stopping.
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for stream in (1, 2):
+                os.dup2(nowhere, stream)
         raise Interrupted(signal.Signals(number).name)
 
-    signal.signal(signal.SIGINT, handler)
-    signal.signal(signal.SIGTERM, handler)
+    for number in numbers:
+        signal.signal(number, handler)

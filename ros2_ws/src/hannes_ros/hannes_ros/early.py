@@ -24,6 +24,12 @@ _PROGRAMS = frozenset(
 )
 
 
+def ending_signals() -> tuple[signal.Signals, ...]:
+    """What ends a node: Ctrl-C, SIGTERM and a terminal that is closed, which `nohup` lets a node outlive."""
+    outlives = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    return (signal.SIGINT, signal.SIGTERM) if outlives else (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
 def leave_at_once(number: int, frame: object) -> None:
     """Signal handler while nothing has been driven or written yet: there is nothing to put away."""
     os._exit(0)
@@ -35,5 +41,5 @@ def _is_node(program: str) -> bool:
 
 
 if sys.argv and _is_node(sys.argv[0]):
-    for _number in (signal.SIGINT, signal.SIGTERM):
+    for _number in ending_signals():
         signal.signal(_number, leave_at_once)

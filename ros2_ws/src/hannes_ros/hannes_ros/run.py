@@ -1,4 +1,4 @@
-"""The main of every node: start, spin, end quietly on SIGINT and SIGTERM, one line for a mistake in the input.
+"""The main of every node: start, spin, end quietly on SIGINT, SIGTERM and SIGHUP, one line for a mistake in the input.
 
 Only the standard library is imported at the top, so that signals are handled before the slow imports begin.
 """
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from hannes_description.errors import HannesError
 
-from .early import leave_at_once
+from .early import ending_signals, leave_at_once
 from .leave import leave_within
 
 if TYPE_CHECKING:
@@ -41,9 +41,9 @@ def run_node(*names: str, executor: str = "events", argv: Sequence[str] | None =
     executor  "events" (fast) or "single" (the ordinary single-threaded one)
     Each class is called with `cli_args` and has `node_name` and `parameters` (a dataclass, for --help); its nodes have
     `done` (true ends the process), `failure` (why) and `stop()` (called before it is destroyed).
-    0 after SIGINT, SIGTERM or the end of the work, 2 after a HannesError or a failure.
+    0 after SIGINT, SIGTERM, SIGHUP or the end of the work, 2 after a HannesError or a failure.
     """
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ending_signals():
         signal.signal(number, leave_at_once)
     arguments = list(sys.argv if argv is None else argv)
     try:
@@ -113,11 +113,11 @@ def _deliver(nodes: Sequence[Any]) -> None:
 
 
 class _StopOnSignal:
-    """Turns SIGINT and SIGTERM into a flag, so that no callback is interrupted halfway."""
+    """Turns what ends a node into a flag, so that no callback is interrupted halfway."""
 
     def __init__(self) -> None:
         self.asked = False
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in ending_signals():
             signal.signal(number, self._ask)
 
     def _ask(self, number: int, frame: object) -> None:
