@@ -315,7 +315,8 @@ def test_best_effort_publishers_are_heard(start: Start, tmp_path: Path, ros_cont
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from std_msgs.msg import Float64
 
-    child = start("recorder", output=str(tmp_path / "bag"), topics=["grip_force", "/other/number"])
+    wanted = ["grip_force", "/other/number", "/other/nubmer"]
+    child = start("recorder", output=str(tmp_path / "bag"), topics=wanted)
     node = Node("driver", context=ros_context)
     profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     outputs = [
@@ -329,7 +330,7 @@ def test_best_effort_publishers_are_heard(start: Start, tmp_path: Path, ros_cont
         return all(output.topic_name.encode() in written(tmp_path / "bag") for output in outputs)
 
     settle(recorded)
-    end(child, signal.SIGINT)
+    assert "no message came on /other/nubmer\n" in end(child, signal.SIGINT)
     assert {entry.name for entry in bag_info(tmp_path / "bag").topics} == {
         "/hannes/grip_force",
         "/other/number",

@@ -137,6 +137,13 @@ def test_bad_files_give_one_clear_error(tmp_path: Path, text: str, message: str)
         read_emg_csv(path)
 
 
+def test_a_table_as_spreadsheets_write_it_is_read(tmp_path: Path):
+    path = tmp_path / "emg.csv"
+    rows = "".join(f"{k / 100},{k},0\r\n" for k in range(20))
+    path.write_text("t_s,close,open\r\n" + rows, encoding="utf-8-sig", newline="")
+    assert read_emg_csv(path).flexor[3] == 3.0
+
+
 def test_missing_file(tmp_path: Path):
     with pytest.raises(HannesError, match=r"Cannot read the EMG file '.*none.csv'"):
         read_emg_csv(tmp_path / "none.csv")

@@ -582,6 +582,7 @@ def cogging_may_be_nought(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "hannes_lab.diagnose._may_be_nought", lambda search, found, limits: found.names[-1] == "cogging"
     )
+    monkeypatch.setattr("hannes_lab.diagnose._is_needed", lambda falls: False)
 
 
 @pytest.mark.usefixtures("cogging_may_be_nought")
@@ -605,10 +606,21 @@ def test_what_is_left_of_a_pair_is_judged_by_itself(
     assert len(found.falls) == 2 and not found.model.effects
 
 
+def test_what_is_foretold_far_worse_without_an_effect_names_it_though_its_intervals_hold_nought(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch, executor: Executor
+) -> None:
+    """Of two or three conditions one that is left out opens every interval."""
+    monkeypatch.setattr("hannes_lab.diagnose._may_be_nought", lambda search, found, limits: True)
+    found = diagnose(prepared, effect_sources(only=["coulomb_friction"]), executor=executor)
+    assert found.verdict == "effects" and [e.name for e in found.effects] == ["coulomb_friction"]
+    assert any(note.startswith("coulomb_friction: its 95 % intervals hold nought") for note in found.notes)
+
+
 def test_where_all_that_joined_may_be_nought_nothing_is_named(
     prepared: Prepared, monkeypatch: pytest.MonkeyPatch, executor: Executor
 ) -> None:
     monkeypatch.setattr("hannes_lab.diagnose._may_be_nought", lambda search, found, limits: True)
+    monkeypatch.setattr("hannes_lab.diagnose._is_needed", lambda falls: False)
     for module in ("diagnose", "choose"):  # as of data that the model alone explains
         monkeypatch.setattr(f"hannes_lab.{module}.is_adequate", lambda *args, **how: True)
     found = diagnose(prepared, effect_sources(only=["coulomb_friction"]), executor=executor)

@@ -391,7 +391,8 @@ def test_real_time_goes_to_zero_volt_when_the_state_stops(peer):
     peer.hear("motor_voltage")
     peer.hear_diagnostics()
     # Long limits: this test is about a state that stops for good, on a machine that may keep each process waiting.
-    with processes(NodeProcess(NAME, clock="realtime", pause_limit_ms=10000, state_timeout_ms=3000)):
+    node = NodeProcess(NAME, clock="realtime", pause_limit_ms=10000, state_timeout_ms=3000)
+    with processes(node):
         announce(peer)
         peer.say("reference_position", convert.float64_bytes(5.0))
 
@@ -405,6 +406,7 @@ def test_real_time_goes_to_zero_volt_when_the_state_stops(peer):
         peer.until(driven, what="a voltage")
         status = peer.until_status(NAME, lambda s: int(s["state_timeouts"]) >= 1, "the timeout")
         peer.until(lambda: voltages(peer)[-1] == 0.0, what="0 V")
+        peer.until(lambda: "motor/state or motor/current is too old: 0 V" in node.output, what="the log")
         before = int(status["rejected_states"])
         peer.say("encoder_position", state_bytes(1_000_000_000, 1.0))  # a stamp of long ago
         peer.until_status(NAME, lambda s: int(s["rejected_states"]) == before + 1, "the old stamp counted")

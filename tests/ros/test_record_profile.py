@@ -70,6 +70,14 @@ def test_a_profile_is_recorded_to_its_end(
     assert np.isin(reference.values, played).all() and reference.time[-1] - reference.time[0] > 2.0
 
 
+def test_what_the_controller_reported_of_a_run_is_told_where_it_was_no_good() -> None:
+    assert graph_watch._told_of_a_run(["ok: running", "warn: running; missed 12 of 1000 cycles"]) == ""
+    told = graph_watch._told_of_a_run(
+        ["ok: running", "error: running; missed 556 of 1006 cycles", "ok: running"]
+    )
+    assert told.startswith("in 1 of its 3 reports ") and "missed 556 of 1006 cycles" in told
+
+
 def test_who_hears_the_reference_of_a_profile() -> None:
     assert followers_of_the_reference(None) == 2
     assert followers_of_the_reference(["motor/state", "reference_position"]) == 2

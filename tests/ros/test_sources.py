@@ -7,6 +7,8 @@ from graph import PATIENT, NodeProcess, Peer, processes
 from hannes_control.double_pid import DoublePID
 from hannes_description.model import Model
 from hannes_ros import convert, topics
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float32
 
 ERROR = "2"
@@ -173,3 +175,13 @@ def test_a_source_of_another_type_is_told(peer):
     with processes(NodeProcess("emg_reference")):
         told = "emg/flexor is published by peer as std_msgs/msg/Float32, which is not heard: it must be std_msgs/"
         peer.until_status("emg_reference", lambda s: told in s["message"] and s["level"] == ERROR, told)
+
+
+def test_a_best_effort_source_is_told(peer):
+    """As drivers of sensors publish: nothing of it is heard either."""
+    peer.hear_diagnostics()
+    quality = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    peer.node.create_publisher(JointState, "motor/state", quality)
+    with processes(NodeProcess("motor_controller")):
+        told = "motor/state is published by peer as best effort (SensorDataQoS), which is not heard: publish it rel"
+        peer.until_status("motor_controller", lambda s: told in s["message"] and s["level"] == ERROR, told)

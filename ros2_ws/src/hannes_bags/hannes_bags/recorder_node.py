@@ -19,7 +19,7 @@ from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
 from hannes_ros.sources import Sources
 from hannes_ros.taking import taken
-from hannes_ros.topics import CLOCK_TOPIC, CLOCK_TYPE, DIAGNOSTICS_TOPIC
+from hannes_ros.topics import CLOCK_TOPIC, CLOCK_TYPE, DIAGNOSTICS_TOPIC, signal
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -402,6 +402,10 @@ class RecorderNode(HannesNode, Node):
                 f"{self._times.hold_ns * 1e-6:.0f} ms after them. Do not use the log times of what has no header."
             )
         self.get_logger().info(f"{recorder.writer.message_count} messages in {self._p.output}")
+        named = self._p.topics or (signal("reference_position").topic,)
+        if silent := [name for name in named if self.resolve_topic_name(name) not in self._begun]:
+            needed = "" if self._p.topics else ", without which a recording cannot be compared with a model"
+            self.get_logger().warning(f"no message came on {' and '.join(silent)}{needed}")
 
 
 def _never_called(data: bytes) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -131,9 +131,9 @@ def followers_of_the_reference(recorded: list[str] | None) -> int:
     return 1 + any(name in (REFERENCE, REFERENCE.removeprefix(f"/{DEFAULT_NAMESPACE}/")) for name in names)
 
 
-def follow_profile(seconds: float, running: Callable[[], bool]) -> None:
+def follow_profile(seconds: float, running: Callable[[], bool]) -> str:
     """Return when the controller has played its profile of so many seconds and the hand has come to rest, or when
-    `running` is no longer true.
+    `running` is no longer true: a sentence on what it reported of itself meanwhile, empty where all was well.
 
     Looks ten times a second whether references have come, instead of at each message: the control loop beside it needs
     the machine. So the time that was played is an estimate, which REST covers.
@@ -145,6 +145,7 @@ def follow_profile(seconds: float, running: Callable[[], bool]) -> None:
             DiagnosticArray, DIAGNOSTICS_TOPIC, _never_called, _listener_qos(), raw=True
         )
         played, health = 0.0, "nothing"
+        reports = list[str]()
         before = last = time.monotonic()
         while running():
             time.sleep(0.1)
@@ -153,9 +154,11 @@ def follow_profile(seconds: float, running: Callable[[], bool]) -> None:
                 played, last = played + now - before, now
             before = now
             told = _health([message for message, _ in taken(said)]).items()
-            health = next((what for who, what in told if who.endswith("motor_controller")), health)
+            new = [what for who, what in told if who.endswith("motor_controller")]
+            health = next(iter(new), health)
+            reports += new if played else []
             if played >= seconds + REST:
-                return
+                return _told_of_a_run(reports)
             if now - last > (STANDS if played else BEGINS):
                 what = (
                     f"stands after {played:.1f} of {seconds:.1f} s, and has not gone on for {STANDS:.0f} s"
@@ -165,6 +168,18 @@ def follow_profile(seconds: float, running: Callable[[], bool]) -> None:
                 raise HannesError(
                     f'The profile {what}; the controller says "{health}". What came is in the bag; record again.'
                 )
+    return ""
+
+
+def _told_of_a_run(reports: Sequence[str]) -> str:
+    """A sentence on a controller's reports of a run, of which errors say that the loop was not the model's."""
+    bad = [said for said in reports if said.startswith("error: ")]
+    if not bad:
+        return ""
+    return (
+        f"in {len(bad)} of its {len(reports)} reports the controller said that its loop was disturbed (the last of "
+        f'them: "{bad[-1]}"): a model has no such loop, and what is recorded may differ from it for that'
+    )
 
 
 def _never_called(data: bytes) -> None:

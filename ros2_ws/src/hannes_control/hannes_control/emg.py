@@ -316,7 +316,7 @@ def read_emg_csv(
     columns: tuple[list[float], list[float], list[float]] = ([], [], [])
     names = (time, close, opening)
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # as spreadsheets write it
             reader = csv.DictReader(file)
             missing = [name for name in names if name not in (reader.fieldnames or ())]
             if missing:

@@ -31,6 +31,8 @@ _PATIENCE_S = 2.0
 """s for which an input may be waited for without a word in the log."""
 _ANOTHER_CLOCK_S = 0.5
 """Stamps that are so far off, or for so long without a good one between, are of another clock; others are late."""
+_SAY_AGAIN_S = 5.0
+TOO_OLD = "motor/state or motor/current is too old: 0 V"
 _ZERO = convert.float64_bytes(0.0)
 _INPUTS = ("encoder_position", "motor_current", "reference_position")
 _TOPICS = tuple(topics.signal(name).topic for name in _INPUTS)
@@ -130,7 +132,7 @@ class MotorController(HannesNode, LifecycleNode):
         self._current: float | None = None
         self._reference: float | None = None
         self._state_at = self._current_at = self._reference_at = 0.0
-        self._stale = False
+        self._stale = self._said_stale = False
         self._late_since: float | None = None
         self._waits_since: float | None = None
         self._reported = 0
@@ -454,6 +456,10 @@ class MotorController(HannesNode, LifecycleNode):
 
     # -- health ------------------------------------------------------------------------------------------------------
     def _check(self) -> None:
+        stale = self._active and self._stale
+        if stale and not self._said_stale:
+            self.get_logger().error(TOO_OLD, throttle_duration_sec=_SAY_AGAIN_S)
+        self._said_stale = stale
         if self._lockstep and self._probe.over() and self._join.synchronised:
             if (left_over := self._join.left_over) is not None:
                 self._on_surplus(left_over)
@@ -514,7 +520,7 @@ class MotorController(HannesNode, LifecycleNode):
                 (level, f"waiting for {', '.join(missing)}", values) if missing else (OK, "running", values)
             )
         if self._stale:
-            return ERROR, "motor/state or motor/current is too old: 0 V", values
+            return ERROR, TOO_OLD, values
         absent = [
             name
             for name, value in zip(

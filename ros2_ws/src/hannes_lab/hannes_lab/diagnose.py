@@ -75,6 +75,10 @@ FORETOLD = 0.25
 """Part of the mean square error on closures or on conditions that were left out, that an effect must remove where the
 rest explains all and no model has the machine's form.  A wrong one bends the fit to its own data."""
 
+NEEDED = 2.0
+"""So many times the error with an effect, or what chance makes of it, without it on closures and on conditions that
+were left out: then it is named also where its intervals hold nought."""
+
 
 def effect_sources(
     extra: Sequence[str] = (), *, only: Sequence[str] | None = None, model: Model | None = None
@@ -299,6 +303,9 @@ def _borne_out(choice: Choice, null: Candidate, falls: tuple[Fall, ...]) -> tupl
         notes += (f"{best.names[-1]} joined too, but {why}: it is left out",)
         falls, alone = falls[:-1], True
         best = search.with_spread(search.fit_of(best.names[:-1]))
+    if best.names and _may_be_nought(search, best, spans_of(search, best, limits, falls)):
+        notes += (_needed_sentence(best.names[-1], falls),)
+        choice = replace(choice, notes=notes)
     deciding = deciding_errors(falls)
     first = before(deciding)
     if not alone and (first == NOMINAL_FITTED or not best.names):
@@ -315,7 +322,8 @@ def _idle_at_the_end(
 
     alone   what joined after it, maybe as one of a pair, has gone
     """
-    if _may_be_nought(search, found, spans_of(search, found, limits, falls)):
+    needed = search.problem.features.repeated and _is_needed(falls)
+    if not needed and _may_be_nought(search, found, spans_of(search, found, limits, falls)):
         return "by its 95 % intervals its strength may be nought"
     before, after = falls[-2].held_out, falls[-1].held_out
     if after > before:
@@ -330,6 +338,26 @@ def _idle_at_the_end(
             f"square must fall by {100 * EACH_TAKES:.0f} %"
         )
     return ""
+
+
+def _is_needed(falls: Sequence[Fall]) -> bool:
+    """Whether without the last effect all that was left out is foretold so much worse that intervals do not matter.
+
+    They are wide where a condition is left out of two or three, since one alone does not tell a friction from a torque
+    constant, whatever there is.
+    """
+    measures = (left_out_errors(falls), [f.held_out_conditions for f in falls])
+    return all(e[-2] >= NEEDED * max(e[-1], 1.0) for e in measures)
+
+
+def _needed_sentence(name: str, falls: Sequence[Fall]) -> str:
+    """Why an effect is named of which the intervals hold nought."""
+    left_out, conditions = left_out_errors(falls)[-2:], [f.held_out_conditions for f in falls[-2:]]
+    return (
+        f"{name}: its 95 % intervals hold nought, since few conditions hardly tell it; it is named "
+        f"because without it the error is {left_out[0]:.3g} instead of {left_out[1]:.3g} on closures and "
+        f"{conditions[0]:.3g} instead of {conditions[1]:.3g} on conditions that were left out: record more conditions"
+    )
 
 
 def _may_be_nought(search: Search, found: Candidate, intervals: Mapping[str, tuple[float, float]]) -> bool:

@@ -258,6 +258,8 @@ def unforetold(choice: Choice) -> tuple[str, ...]:
     if first is None or choice.best.names or not known or first.explained < MOST:
         return ()
     names = " + ".join(first.names)
+    if any(note.startswith(f"{first.names[0]} joined too") for note in choice.notes):
+        return ()
     return (
         f"{names} alone explains {100 * first.explained:.0f} % of the excess misfit of a fit to all conditions, but "
         "those that were left out of a fit are foretold no better with it: they may be too unlike to foretell one "

@@ -1,9 +1,10 @@
-"""Each topic has one source: who tells of a second one, whose messages mix with those of the first, and of one whose
-messages are of another type, which nobody hears."""
+"""Each topic has one source: who tells of a second one, whose messages mix with those of the first, and of one whom
+nobody hears, since its messages are of another type or may get lost."""
 
 from __future__ import annotations
 
 from rclpy.node import Node
+from rclpy.qos import ReliabilityPolicy
 
 from .topics import CLOCK_TOPIC, CLOCK_TYPE, signal
 
@@ -30,23 +31,29 @@ class Sources:
         return any(self.count(name) > 1 for name in self._names)
 
     def several(self) -> str | None:
-        """What to report of inputs with several publishers, or one of another type, logged too; None if all is well."""
+        """What to report of inputs with several publishers, or one who is not heard; None if all is well."""
         counts = {name: self.count(name) for name in self._names}
         mixed = [f"{n} publishers of {_topic(name)}" for name, n in counts.items() if n > 1]
-        wrong = [text for name, n in counts.items() if n for text in self._of_another_type(name)]
+        wrong = [text for name, n in counts.items() if n for text in self._unheard(name)]
         if not (mixed or wrong):
             return None
         text = "; ".join([*wrong, *([f"{', '.join(mixed)}; {self._rule}"] if mixed else [])])
         self._node.get_logger().error(text, throttle_duration_sec=_LOG_S)
         return text
 
-    def _of_another_type(self, name: str) -> list[str]:
+    def _unheard(self, name: str) -> list[str]:
+        """Why a publisher is not heard: the type of its messages, or a best-effort one where every message counts."""
         topic, wanted = _topic(name), CLOCK_TYPE if name == CLOCK_TOPIC else signal(name).type
-        return [
-            f"{topic} is published by {info.node_name} as {info.topic_type}, which is not heard: it must be {wanted}"
-            for info in self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
-            if info.topic_type != wanted
-        ]
+        out = []
+        for info in self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic)):
+            said = f"{topic} is published by {info.node_name}"
+            if info.topic_type != wanted:
+                out.append(f"{said} as {info.topic_type}, which is not heard: it must be {wanted}")
+            elif info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT and name != CLOCK_TOPIC:
+                out.append(
+                    f"{said} as best effort (SensorDataQoS), which is not heard: publish it reliable (depth 10)"
+                )
+        return out
 
     def surplus(self, name: str) -> str:
         """The error of a lock-step whose messages no longer belong together, because of that signal's topic."""

@@ -131,9 +131,11 @@ def _record_profile(
             wait_for_recorder(lambda: bool(group.running))
             driving = find_command(NODES["motor_controller"], "motor_controller", environment)
             group.start("motor_controller", [*driving, *_words(controller, [])])
-            follow_profile(seconds, lambda: len(group.running) == 2)
+            disturbed = follow_profile(seconds, lambda: len(group.running) == 2)
             if len(group.running) < 2:
                 raise typer.Exit(1)
+            if disturbed:
+                typer.echo(f"note: {disturbed}", err=True)
         except Interrupted:
             typer.echo("interrupted: what was recorded is kept", err=True)
 
