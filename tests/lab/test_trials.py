@@ -238,6 +238,17 @@ def test_a_closure_unlike_the_others_in_which_samples_are_missing_is_said_to_be_
     assert without_outliers(short).notes == (started + " (samples of encoder_position are missing in it)",)
 
 
+def test_where_the_source_of_the_reference_ended_is_no_rest() -> None:
+    """A board that dies in the third closure: the last reference stands there for longer than the hand rests."""
+    whole = recording(np.concatenate((half_sine(3), np.zeros(12000))), 250.0)
+    channel = whole["reference_position"]
+    there = np.asarray(channel.time) < 8.7
+    died = Channel(channel.time[there], channel.values[there], "rad", "reference_position")
+    trial = make_trial(replace(whole, channels={**whole.channels, "reference_position": died}))
+    assert len(trial.closures) == 2 and trial.conditions == (trial.name,)
+    assert [round(c.start) for c in trial.closures] == [0, 4] and "1 of 3 closures is cut off" in trial.notes[0]
+
+
 def test_gaps_in_every_closure_are_the_error() -> None:
     spoilt = recording(half_sine(3), 250.0)
     for k in range(3):

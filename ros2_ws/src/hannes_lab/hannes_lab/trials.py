@@ -60,6 +60,9 @@ LEAST_GAP = 0.05
 SHORT = 2.5
 """Steps of a signal without a sample from which it is said to miss some in a closure that is unlike the others."""
 
+HOLDS = 0.5
+"""s for which the last value of a reference holds at least."""
+
 FOLLOWED = 0.25
 """Part of the reference's span that an encoder goes over in a gap of it where there was something to follow."""
 
@@ -583,7 +586,7 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     _check_overlap(recording)
     origin = float(channel.time[0])
     origin = math.floor(origin / period + 1e-6) * period
-    duration = recording.end - origin
+    duration = min(recording.end, _known_until(channel.time)) - origin
     samples = {
         s: (np.asarray(c.time) - origin, np.asarray(c.values, dtype=float))
         for s, c in recording.channels.items()
@@ -638,6 +641,12 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
         recording.sha256,
         tuple(notes),
     )
+
+
+def _known_until(time: Array) -> float:
+    """Until when [s] a reference is known that was logged at these times: its last value holds for as long as one did
+    before, or HOLDS.  After that its source has ended, and where it stood then is no rest."""
+    return float(time[-1]) + max(HOLDS, float(np.diff(time).max(initial=0.0)))
 
 
 def _as_it_is(sensors: Any, current: Array) -> tuple[Any, list[str]]:
