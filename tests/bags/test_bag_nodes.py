@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bags.bag_samples import MOTOR, foreign_bag, motor_messages, recording
+from hannes_bags import cdr
 from hannes_bags.reading import bag_info, read_bag
 from hannes_bags.recover import recover
 from hannes_bags.storage import BagMessages, locate
@@ -35,13 +36,13 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 @pytest.fixture
 def start(ros_environment: dict[str, str], tmp_path: Path) -> Iterator[Start]:
-    """Start a node of hannes_bags with these parameters; killed at the end of the test."""
+    """Start a node of hannes_bags, or a module, with these parameters; killed at the end of the test."""
     children: list[subprocess.Popen[str]] = []
 
     def run(node: str, **parameters: Any) -> subprocess.Popen[str]:
         words = [w for name, value in parameters.items() for w in ("-p", f"{name}:={json.dumps(value)}")]
         child = subprocess.Popen(
-            [sys.executable, "-m", f"hannes_bags.{node}_node", "--ros-args", *words],
+            [sys.executable, "-m", node if "." in node else f"hannes_bags.{node}_node", "--ros-args", *words],
             env=ros_environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
         children.append(child)
@@ -471,6 +472,49 @@ def test_a_bag_is_not_played_where_another_node_publishes(start: Start, tmp_path
     assert any(announced() == 0 for _ in range(5))
     for wanted in ({"topics": ["/hannes/grip_force"]}, {"topics": voltage, "beside": True}):
         assert "played " in end(start("player", bag=bag, subscribers=1, wait=PATIENCE, **wanted))
+
+
+def test_a_hand_in_lockstep_gets_every_command_of_a_bag_however_fast_it_is_played(
+    start: Start, tmp_path: Path, ros_context: Any
+) -> None:
+    """It answers some 2000 ticks a second; what is more than its queue holds would be lost without a word."""
+    from hannes_ros import convert, topics
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.node import Node
+
+    ticks = 3000
+    values = cdr.encode_float64(np.linspace(0.0, 0.5, ticks))
+    stamps = np.arange(ticks) * 1_000_000
+    messages = {"/hannes/motor/voltage": (cdr.FLOAT64, list(zip(stamps.tolist(), values, strict=True)))}
+    bag = foreign_bag(tmp_path / "bag", messages)
+    listener = Node("listener", context=ros_context, namespace="hannes")
+    ears = SingleThreadedExecutor(context=ros_context)
+    ears.add_node(listener)
+    heard: list[int] = []
+    hand = start("hannes_sim.sim_node", clock="lockstep")
+    topics.subscription(listener, "motor_current", lambda data: None)
+    topics.subscription(
+        listener, "encoder_position", lambda data: heard.append(convert.MOTOR_STATE.decode(data).stamp_ns)
+    )
+    player = start(
+        "player",
+        bag=str(bag),
+        topics=["/hannes/motor/voltage"],
+        clock=False,
+        fast=True,
+        wait=PATIENCE,
+        subscribers=1,
+    )
+
+    def answered() -> bool:
+        ears.spin_once(timeout_sec=0.1)
+        return bool(heard) and heard[-1] >= stamps[-1]
+
+    settle(answered)
+    assert f"played {ticks} messages" in end(player)
+    end(hand, signal.SIGINT)
+    ears.shutdown()
+    listener.destroy_node()
 
 
 def test_time_is_told_by_one_node(start: Start, tmp_path: Path, driver: Any) -> None:

@@ -246,7 +246,9 @@ def test_where_the_source_of_the_reference_ended_is_no_rest() -> None:
     died = Channel(channel.time[there], channel.values[there], "rad", "reference_position")
     trial = make_trial(replace(whole, channels={**whole.channels, "reference_position": died}))
     assert len(trial.closures) == 2 and trial.conditions == (trial.name,)
-    assert [round(c.start) for c in trial.closures] == [0, 4] and "1 of 3 closures is cut off" in trial.notes[0]
+    assert [round(c.start) for c in trial.closures] == [0, 4] and "1 of 3 closures is cut off" in trial.notes[
+        0
+    ]
 
 
 def test_gaps_in_every_closure_are_the_error() -> None:

@@ -6,6 +6,7 @@ given time; who calls it decides how time passes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -121,13 +122,16 @@ class Schedule:
         """Simulated time (ns) after `elapsed` s of playing."""
         return self.first_ns + round(elapsed * self._rate * 1e9)
 
-    def due(self, elapsed: float, at_most: int = 1000) -> list[tuple[int, tuple[tuple[str, bytes], ...]]]:
-        """The ticks (simulated time ns, messages) that are due after `elapsed` s, at most so many at once."""
-        now = None if self._rate == 0.0 else self.time_at(elapsed)
+    def due(
+        self, elapsed: float, at_most: int = 1000, until: float = math.inf
+    ) -> list[tuple[int, tuple[tuple[str, bytes], ...]]]:
+        """The ticks (simulated time ns, messages) that are due after `elapsed` s, at most so many at once, and none
+        later than `until` s of the bag."""
+        now = min(self._due_until(elapsed), self.first_ns + until * 1e9)
         ticks: list[tuple[int, tuple[tuple[str, bytes], ...]]] = []
         while self._next is not None and len(ticks) < at_most:
             log_ns, messages = self._next
-            if now is not None and log_ns + self._shift > now:
+            if log_ns + self._shift > now:
                 break
             ticks.append((log_ns + self._shift, self._restamped(messages)))
             self._next = next(self._ticks, None)
@@ -137,6 +141,16 @@ class Schedule:
                 self._ticks = self._playlist.ticks()
                 self._next = next(self._ticks, None)
         return ticks
+
+    def held(self, elapsed: float, until: float) -> bool:
+        """Whether a tick is due after `elapsed` s that is later than `until` s of the bag."""
+        if self._next is None:
+            return False
+        at = self._next[0] + self._shift
+        return self.first_ns + until * 1e9 < at <= self._due_until(elapsed)
+
+    def _due_until(self, elapsed: float) -> float:
+        return math.inf if self._rate == 0.0 else self.time_at(elapsed)
 
     def _restamped(self, messages: tuple[tuple[str, bytes], ...]) -> tuple[tuple[str, bytes], ...]:
         """From the second round on, the stamps go on growing with the clock."""

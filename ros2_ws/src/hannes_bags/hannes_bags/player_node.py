@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass
 from time import monotonic
@@ -17,7 +18,9 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 
+from .cdr import stamp_at
 from .player import Schedule, load_playlist
 from .recorder_node import message_class
 from .storage import TopicEntry
@@ -29,6 +32,8 @@ _FAST_TICKS = 5
 """Distinct times a step in fast mode, so 5000 a second. DDS has no back pressure on readers that keep the last n, and
 acknowledgements come with heartbeats, every 3 s: what bounds the speed is what a Python subscriber can take."""
 _TICKS_AT_ONCE = 1000
+_LEAD_S = 0.2
+"""s by which commands may be ahead of the hand that answers them tick by tick: it keeps a second of them."""
 _ARRIVAL_S = 3.5
 _LOOK_S = 0.1
 _QUIET_S, _LONGEST_S = 0.5, 3.0
@@ -45,7 +50,7 @@ class PlayerParameters:
     bag: str = parameter("", "the bag to play: a folder, a .mcap or a .db3 file")
     rate: float = parameter(1.0, "played seconds in a second", lower=1e-3, upper=1e3)
     fast: bool = parameter(
-        False, "as fast as subscribers can follow (5000 ticks a second), instead of at `rate`"
+        False, "5000 ticks a second, or as fast as a hand in lock-step answers, instead of at `rate`"
     )
     topics: tuple[str, ...] = parameter((), "topics to play; empty for all but /diagnostics")
     beside: bool = parameter(False, "play topics too that another node publishes")
@@ -77,6 +82,12 @@ class PlayerNode(HannesNode, Node):
         playlist = load_playlist(p.bag, topics=p.topics, start=p.start)
         self._schedule = Schedule(playlist, 0.0 if p.fast else p.rate, loop=p.loop)
         self._topics = playlist.topics
+        # A hand in lock-step takes one command for each tick, and tells the time.
+        voltage = self.resolve_topic_name(topics.signal("motor_voltage").topic)
+        self._follows = not p.clock and voltage in {entry.name for entry in playlist.topics}
+        self._hand: tuple[int, int] | None = None
+        self._hand_at = 0.0
+        self._told = False
         self._sim_clock: Publisher | None = None
         self._outputs: dict[str, Publisher] = {}
         self._began: float | None = None
@@ -97,6 +108,9 @@ class PlayerNode(HannesNode, Node):
         # First: who finds another topic, and looks for simulated time, finds this too.
         if self._p.clock:
             self._sim_clock = topics.clock_publisher(self)
+        if self._follows:
+            newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+            self.create_subscription(Clock, topics.CLOCK_TOPIC, self._on_clock, newest, raw=True)
         self._outputs = {entry.name: self._publisher(entry) for entry in self._topics}
         self._opened = self._changed = monotonic()
 
@@ -117,7 +131,10 @@ class PlayerNode(HannesNode, Node):
             return
         now = monotonic()
         elapsed = now - (self._began or now)
-        ticks = self._schedule.due(elapsed, _FAST_TICKS if self._p.fast else _TICKS_AT_ONCE)
+        until = self._until()
+        if self._schedule.held(elapsed, until):
+            self._stands(until)
+        ticks = self._schedule.due(elapsed, _FAST_TICKS if self._p.fast else _TICKS_AT_ONCE, until)
         for stamp_ns, messages in ticks:
             self._tell_time(stamp_ns, now)
             for topic, data in messages:
@@ -127,6 +144,25 @@ class PlayerNode(HannesNode, Node):
             self._tell_time(self._schedule.time_at(elapsed), now)
         if self._schedule.done:
             self.done = True
+
+    def _on_clock(self, data: bytes) -> None:
+        now = stamp_at(data)
+        if now is not None:
+            self._hand, self._hand_at = (self._hand[0] if self._hand else now, now), monotonic()
+
+    def _until(self) -> float:
+        """Up to which time of the bag [s] may be played: a hand in lock-step must keep up, or commands are lost."""
+        if not self._follows or not self._told:
+            return math.inf
+        return _LEAD_S + (0.0 if self._hand is None else (self._hand[1] - self._hand[0]) * 1e-9)
+
+    def _stands(self, until: float) -> None:
+        """End where the hand has not gone on for `wait` seconds."""
+        if monotonic() - max(self._hand_at, self._began or 0.0) > self._p.wait:
+            self.fail(
+                f"The hand that takes {topics.signal('motor_voltage').topic} in lock-step has stood for "
+                f"{self._p.wait:g} s, at {until - _LEAD_S:.3f} s of the bag: see `hannes nodes` for what it waits for."
+            )
 
     def _ready(self) -> bool:
         """Whether nobody else publishes the topics and each has its subscribers; the time of playing begins then."""
@@ -163,6 +199,7 @@ class PlayerNode(HannesNode, Node):
 
     def _look(self) -> None:
         """Whether the graph still changes; while it plays, whether somebody else began to."""
+        self._told = self._follows and self.count_publishers(topics.CLOCK_TOPIC) > 0
         if self._began is None:
             listeners = [output.get_subscription_count() for output in self._outputs.values()]
             seen = len(self.get_node_names()), listeners, self._others()

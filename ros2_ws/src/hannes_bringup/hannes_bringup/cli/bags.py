@@ -143,7 +143,9 @@ def _record_profile(
 def play(
     bag: Annotated[Path, typer.Argument(help="The bag: a rosbag2 folder, an .mcap or a .db3 file.")],
     rate: Annotated[float, typer.Option(min=0.001, max=1000.0, help="Played seconds in a second.")] = 1.0,
-    fast: Annotated[bool, typer.Option("--fast", help="As fast as the subscribers can follow.")] = False,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="5000 ticks a second, or as fast as a hand in lock-step answers.")
+    ] = False,
     loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
     start: Annotated[float, typer.Option(min=0.0, help="Time to skip at the beginning, s.")] = 0.0,
     topic: Annotated[
