@@ -290,6 +290,17 @@ def test_the_crest_of_a_ripple_is_no_object() -> None:
     assert seen is not None and seen[0] == pytest.approx(0.21 * 0.08, rel=0.5) and 7.0 < seen[1] < 9.5
 
 
+def test_what_the_hand_goes_on_through_is_no_object() -> None:
+    """A spike of the current, of a loop that a busy machine disturbed, rises as a rigid object does."""
+    q = np.linspace(2.8, 14.0, 400)
+    spike = np.interp(q, [7.8, 8.0, 8.2], [0.0, 1.5, 0.0])
+    nominal = (0.035, 0.0015, 0.21)
+    assert _seen(signed(q, 0.25 + spike), [], nominal) is None
+    gripped = q < 8.0
+    seen = _seen(signed(q[gripped], (0.25 + spike)[gripped]), [], nominal)
+    assert seen is not None and seen[1] == pytest.approx(7.8, abs=0.1)
+
+
 def test_a_free_hand_takes_about_what_the_nominal_one_does() -> None:
     """A quick closure that brakes for most of its way says little of what moves a slow one."""
     q = np.linspace(2.5, 12.5, 200)

@@ -204,6 +204,12 @@ class Sensors:
     (
         ({"current": math.nan}, "motor/current is not finite (nan): 0 V", "2"),
         ({"position": math.nan}, "position of motor/state is not finite (nan): 0 V", "2"),
+        ({"current": 200.0}, "motor/current of 200 A is beyond what this hand has, 24.", "2"),
+        (
+            {"position": 57.3},
+            "position of motor/state of 57.3 rad is beyond what this hand has, -15.6 .. 31.2",
+            "2",
+        ),
         ({"reference": math.nan}, "reference_position is not finite (nan): the last good one holds", "1"),
         ({"reference": 400.0}, "reference_position of 400 rad is limited to 0 .. 15.6 rad", "1"),
     ),

@@ -32,6 +32,9 @@ _PATIENCE_S = 2.0
 _ANOTHER_CLOCK_S = 0.5
 """Stamps that are so far off, or for so long without a good one between, are of another clock; others are late."""
 _SAY_AGAIN_S = 5.0
+_STALLED = 3.0
+"""Multiples of the current of the stalled motor above which a reading is none: driven backwards at full speed it draws
+twice that."""
 TOO_OLD = "motor/state or motor/current is too old: 0 V"
 _ZERO = convert.float64_bytes(0.0)
 _INPUTS = ("encoder_position", "motor_current", "reference_position")
@@ -116,6 +119,12 @@ class MotorController(HannesNode, LifecycleNode):
         if self._profile is not None:
             check_travel(p.reference_amplitude, model.parameters)
         self._travel = travel_of(model.parameters)
+        values = model.parameters
+        self._most_current = (
+            _STALLED * values.value("supply.voltage") / values.value("motor.resistance")
+            if {"supply.voltage", "motor.resistance"} <= set(values)
+            else math.inf
+        )
         self._lockstep = p.clock == "lockstep"
         self._active = self._tripped = False
         self._health = Health(
@@ -243,8 +252,12 @@ class MotorController(HannesNode, LifecycleNode):
 
     # -- the law -----------------------------------------------------------------------------------------------------
     def _command(self, reference: float | None, position: float, current: float) -> float:
-        """Voltage (V), clamped; a sensor that is not finite gives 0 V and a cleared controller, no reference 0 V."""
+        """Voltage (V), clamped; a sensor that is not finite, or beyond what the hand has, gives 0 V and a cleared
+        controller, no reference 0 V."""
         if reference is None:
+            return 0.0
+        if not (self._is_place(position) and self._is_drawn(current)):
+            self._clear()
             return 0.0
         try:
             voltage = self._pid.update(reference, position, current)
@@ -259,7 +272,15 @@ class MotorController(HannesNode, LifecycleNode):
         except HannesError as error:
             self._reject_state(ERROR, str(error))
             return None
-        self._finite("position of motor/state", sample.position[0], ERROR, "0 V")
+        name, position = "position of motor/state", sample.position[0]
+        if self._finite(name, position, ERROR, "0 V"):
+            most = 2.0 * self._travel
+            self._possible(
+                name,
+                self._is_place(position),
+                f"{position:g} rad",
+                f"{-self._travel:g} .. {most:g} rad: in rad?",
+            )
         return sample
 
     def _reject_state(self, level: bytes, why: str) -> None:
@@ -268,8 +289,31 @@ class MotorController(HannesNode, LifecycleNode):
 
     def _decode_current(self, data: bytes) -> float:
         current = convert.float64_value(data)
-        self._finite("motor/current", current, ERROR, "0 V")
+        if self._finite("motor/current", current, ERROR, "0 V"):
+            self._possible(
+                "motor/current",
+                self._is_drawn(current),
+                f"{current:g} A",
+                f"{self._most_current:.3g} A: in A?",
+            )
         return current
+
+    def _is_place(self, position: float) -> bool:
+        """Whether the hand can be there: its encoder may be zeroed anywhere along its way."""
+        return not (position < -self._travel or position > 2.0 * self._travel)
+
+    def _is_drawn(self, current: float) -> bool:
+        return not abs(current) > self._most_current
+
+    def _possible(self, name: str, is_so: bool, value: str, most: str) -> None:
+        """Count and report an input that no hand gives: one in another unit would be driven against."""
+        if is_so:
+            self._health.faults.good(f"{name}, its range")
+            return
+        self._health.count("rejected_inputs")
+        self._health.faults.bad(
+            f"{name}, its range", ERROR, f"{name} of {value} is beyond what this hand has, {most} 0 V"
+        )
 
     def _decode_reference(self, data: bytes) -> float | None:
         """The reference (rad) from here on: within the hand's travel, beyond which the motor would stall or unwind.
