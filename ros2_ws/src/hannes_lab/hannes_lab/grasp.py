@@ -62,8 +62,8 @@ STIFFER = 3.0
 PRESSED = 5.0
 """Multiples of the seen excess that an object may take where the closing ends, by its stiffness and its depth there.
 
-It takes about what is seen (2.1 at most in recordings of grasps).  A spike of a loop that a busy machine disturbed rises
-as if a rigid object stood there, and the hand goes on (12 to 23)."""
+It takes about what is seen (2.1 at most in recordings of grasps).  A spike of a loop that a busy machine disturbed
+rises as if a rigid object stood there, and the hand goes on (12 to 23)."""
 
 PLACES = 200
 """How many places along the way a curve is looked at for its ripple."""
