@@ -10,7 +10,7 @@ from hannes_control.reference import half_sine
 from hannes_description.model import Model
 from hannes_description.signals import SIGNALS
 from hannes_lab.compare import compare
-from hannes_lab.depends import _dependences, _oscillation, pointed_at, residual_dependences
+from hannes_lab.depends import Dependence, _dependences, _oscillation, pointed_at, residual_dependences
 from hannes_lab.features import Features
 from hannes_lab.hand import make_controller
 from hannes_lab.hide import make_set
@@ -113,6 +113,18 @@ def test_an_offset_depends_on_nothing_and_without_an_encoder_place_and_speed_are
     assert variables(without) == {"position", "velocity", "direction", "time"}, "no signal tells the load"
 
 
+def test_of_a_machine_that_goes_one_way_only_nothing_depends_on_the_direction() -> None:
+    moves = np.concatenate([np.zeros(100), np.full(100, 0.3), np.zeros(100), np.full(100, -0.3)])
+
+    def variables(velocity: np.ndarray) -> set[str]:
+        states = {"velocity": [velocity[None]], "direction": [velocity[None]]}
+        error = np.where(velocity != 0.0, 0.1, 0.0)
+        found = _dependences({"motor_current": [error[None]]}, states, "motor_current", [0.01])
+        return {d.variable for d in found}
+
+    assert "direction" in variables(moves) and "direction" not in variables(moves[:300])
+
+
 def test_what_brakes_at_a_place_both_ways_is_told_though_its_mean_there_is_nothing() -> None:
     """A belt that rubs where it is spliced: along the position alone there is nothing to see."""
     there = np.linspace(0.0, 1.0, 200)
@@ -187,3 +199,12 @@ def test_what_a_fit_took_where_is_said() -> None:
     value = found.values["hand.stiffness"]
     assert value > 0.002 and f"hand.stiffness {value:.3g} N.m/rad instead of 0.0015 (" in note
     assert found.to_dict()["values"] == found.values
+
+
+def test_what_goes_with_a_place_that_is_passed_once_is_told_last() -> None:
+    """An error that grows along the way of an open loop goes with the place, too."""
+    once = Dependence("position", "encoder_position", 0.75, (), (), "rad", -27.0, 0.0)
+    alike = Dependence("position", "encoder_position", 0.75, (), (), "rad", 1.0, 0.5)
+    speed = Dependence("velocity", "encoder_position", 0.6, (), ())
+    assert sorted([once, speed, alike], key=lambda d: -d.telling) == [alike, speed, once]
+    assert once.said == "position (-27 rad) 75 % (0 % alike in all passes)"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.executor import Executor
 from hannes_lab.prepare import Prepared, prepare
-from hannes_lab.rig import load_rig
+from hannes_lab.problem import nuisance_coordinate
+from hannes_lab.rig import Nuisance, load_rig
+from hannes_lab.wording import _coasting
 from hannes_sim.effect import load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.rollout import rollout
@@ -82,6 +85,33 @@ def test_a_bridge_that_coasts_takes_the_back_emf_away_between_its_pulses() -> No
     assert speed(0.5, 0.0) == pytest.approx(0.5 * supply / emf, rel=0.02)
     assert speed(0.5, 1.0) == pytest.approx(supply / emf, rel=0.02)
     assert speed(1.0, 1.0) == pytest.approx(speed(1.0, 0.0), rel=1e-6)
+
+
+class Known(dict[str, float]):
+    def value(self, name: str) -> float:
+        return self[name]
+
+
+@pytest.mark.parametrize(
+    ("fitted", "signals", "compensated", "told"),
+    [
+        (0.006, ["encoder_position"], 0.0, True),
+        (0.04, ["encoder_position"], 0.0, False),  # too high
+        (0.006, ["encoder_position", "motor_current"], 0.0, False),  # the current tells the torque constant
+        (0.006, ["encoder_position"], 1.0, False),  # the command is a current
+    ],
+)
+def test_a_torque_constant_that_is_far_too_low_points_at_the_bridge(
+    fitted: float, signals: list[str], compensated: float, told: bool
+) -> None:
+    kt = nuisance_coordinate(Nuisance("motor.kt", 0.0175, 0.1, True))
+    blocks = [SimpleNamespace(signal=signal) for signal in signals]
+    problem = SimpleNamespace(rig=SimpleNamespace(foreign=True), features=SimpleNamespace(blocks=blocks))
+    parameters = Known({"motor.emf_compensated": compensated})
+    search = SimpleNamespace(problem=problem, model=SimpleNamespace(parameters=parameters))
+    best = SimpleNamespace(fit=SimpleNamespace(values={"motor.kt": fitted}, off=[(kt, abs(kt.z(fitted)))]))
+    said = _coasting(search, best)  # type: ignore[arg-type]
+    assert [("coasting_bridge.py" in note) for note in said] == [True] * told
 
 
 def test_what_swings_is_unknown_and_its_frequency_is_said(prepared: Prepared, executor: Executor) -> None:

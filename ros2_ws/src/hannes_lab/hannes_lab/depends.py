@@ -58,6 +58,9 @@ SHOWN = 0.2
 TREND = 0.85
 """Correlation of a curve with the place from which it is told as what grows or falls along the whole way."""
 
+OTHER_WAY = 0.01
+"""Part of the samples that move the other way, below which there is one direction only."""
+
 ABOVE = 2.0
 """Times that a mean residual's square must exceed what the closures' scatter makes of it, to show a frequency."""
 AT_REST = 1e-3
@@ -88,11 +91,21 @@ class Dependence:
     repeated: float = 0.0
 
     @property
+    def telling(self) -> float:
+        """The share, or what is alike in all passes of a place where little is: an error that grows along a way which
+        is passed once goes with the place, too, and says nothing of it."""
+        return self.repeated if self._passed_once else self.share
+
+    @property
+    def _passed_once(self) -> bool:
+        return self.variable in PLACES and self.share >= SHOWN > self.repeated
+
+    @property
     def said(self) -> str:
         """The variable and its share, in words."""
         where = "" if self.at is None or self.share == 0.0 else f" ({self.at:.2g} {self.unit})"
         share = f"{100 * self.share:.0f} %"
-        if self.variable in PLACES and self.share >= SHOWN > self.repeated:
+        if self._passed_once:
             share += f" ({100 * self.repeated:.0f} % alike in all passes)"
         return f"{self.variable.replace('_', ' ')}{where} {share}"
 
@@ -154,7 +167,7 @@ def residual_dependences(
         *_dependences(residuals, known, signal, steps, units),
         *_oscillation(signal, residuals[signal], steps),
     ]
-    return tuple(sorted(found, key=lambda d: -d.share))
+    return tuple(sorted(found, key=lambda d: -d.telling))
 
 
 def pointed_at(found: Sequence[Dependence], drive: Sequence[str]) -> str:
@@ -308,7 +321,7 @@ def _dependences(
                 [np.repeat(np.linspace(0.0, 1.0, a.shape[0]), a.shape[1]) for a in residuals[signal]]
             )
             target = np.concatenate([a.ravel() for a in residuals[signal]])
-        elif variable not in states:
+        elif variable not in states or (variable == "direction" and _one_way(states[variable])):
             continue
         else:
             values = np.concatenate([a.mean(axis=0) for a in states[variable]])
@@ -350,6 +363,12 @@ def _with_place(found: Dependence, level: float = 0.0) -> Dependence:
     if not found.curve:
         return found
     return replace(found, at=found.centres[int(np.argmax(np.abs(np.subtract(found.curve, level))))])
+
+
+def _one_way(velocities: Sequence[Array]) -> bool:
+    """Whether nothing moves the other way: what differs between moving and standing is no matter of direction."""
+    way = _direction(np.concatenate([a.mean(axis=0) for a in velocities]))
+    return min(float(np.mean(way == one)) for one in (-1.0, 1.0)) < OTHER_WAY
 
 
 def _direction(velocity: Array) -> Array:

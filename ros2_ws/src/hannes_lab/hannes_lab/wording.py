@@ -234,6 +234,7 @@ def notes(
         *_inseparable(search, experiments),
         *_ends(search, best, effects),
         *_few_waves(search, best),
+        *_coasting(search, best),
         *_undescribed(best),
         *_taken_for_its_own(search, best),
         *_identifiability(best),
@@ -249,6 +250,24 @@ def _few_waves(search: Search, best: Candidate) -> list[str]:
         for name in best.names
         if (waves := waves_of(search, best, name)) < SHOWN_WAVES
     ]
+
+
+def _coasting(search: Search, best: Candidate) -> list[str]:
+    """What a torque constant far below its nominal value is, too, on a machine whose voltage alone is known."""
+    problem = search.problem
+    blocks = {block.signal for block in problem.features.blocks}
+    name, known = "motor.emf_compensated", search.model.parameters
+    of_current = name in known and known.value(name) > 0.0
+    if not problem.rig.foreign or of_current or "motor_current" in blocks:
+        return []
+    low = any(
+        c.name == "motor.kt" and off > FAR and c.z(best.fit.values[c.name]) < 0.0 for c, off in best.fit.off
+    )
+    return [
+        "motor.kt comes out far too low where a bridge coasts between its pulses, too: it brakes less than the model "
+        "by its back-EMF. examples/effects/coasting_bridge.py of the project is an effect for that "
+        "(--effect FILE:CoastingBridge)"
+    ] * low
 
 
 def unforetold(choice: Choice) -> tuple[str, ...]:
