@@ -18,6 +18,9 @@ for _library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 # A script that runs the tests in its background makes all below it deaf to Ctrl-C, of which some tests are.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+# and `nohup` to a terminal that is closed
+if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 

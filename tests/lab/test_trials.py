@@ -246,9 +246,13 @@ def test_where_the_source_of_the_reference_ended_is_no_rest() -> None:
     died = Channel(channel.time[there], channel.values[there], "rad", "reference_position")
     trial = make_trial(replace(whole, channels={**whole.channels, "reference_position": died}))
     assert len(trial.closures) == 2 and trial.conditions == (trial.name,)
-    assert [round(c.start) for c in trial.closures] == [0, 4] and "1 of 3 closures is cut off" in trial.notes[
-        0
-    ]
+    assert [round(c.start) for c in trial.closures] == [0, 4]
+    assert "the reference ends" in trial.notes[0] and "1 of 3 closures is cut off" in trial.notes[1]
+    # a script that ends after its last motion: the hand rests, and is still recorded
+    rests = np.asarray(channel.time) < 11.0
+    ended = Channel(channel.time[rests], channel.values[rests], "rad", "reference_position")
+    trial = make_trial(replace(whole, channels={**whole.channels, "reference_position": ended}))
+    assert len(trial.closures) == 3 and not trial.notes
 
 
 def test_gaps_in_every_closure_are_the_error() -> None:

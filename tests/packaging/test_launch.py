@@ -315,9 +315,16 @@ def test_no_child_outlives_a_command_whose_terminal_is_closed_or_that_is_killed(
             os.kill(parent, signal.SIGKILL)
     finally:
         os.close(terminal)
-        os.waitpid(parent, 0)
-    state = Path(f"/proc/{found[1]}/stat")
+        _, status = os.waitpid(parent, 0)
+    assert os.waitstatus_to_exitcode(status) == (-signal.SIGKILL if how == "killed" else 0)
     end = monotonic() + PATIENCE
-    while state.exists() and state.read_text().rpartition(")")[2].split()[0] != "Z":
+    while is_running(int(found[1])):
         assert monotonic() < end, "the child still runs"
         sleep(0.02)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

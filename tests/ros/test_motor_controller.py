@@ -204,12 +204,6 @@ class Sensors:
     (
         ({"current": math.nan}, "motor/current is not finite (nan): 0 V", "2"),
         ({"position": math.nan}, "position of motor/state is not finite (nan): 0 V", "2"),
-        ({"current": 200.0}, "motor/current of 200 A is beyond what this hand has, 24.", "2"),
-        (
-            {"position": 57.3},
-            "position of motor/state of 57.3 rad is beyond what this hand has, -15.6 .. 31.2",
-            "2",
-        ),
         ({"reference": math.nan}, "reference_position is not finite (nan): the last good one holds", "1"),
         ({"reference": 400.0}, "reference_position of 400 rad is limited to 0 .. 15.6 rad", "1"),
     ),
@@ -226,13 +220,43 @@ def test_bad_inputs_are_said_until_good_ones_come(peer, bad, said, level):
         status = sensors.until(lambda s: said in s["message"], "the rejected input")
         assert status["level"] >= level
         # the voltages and the status are two topics: what was sent before the status may still be on its way
-        peer.until(
-            lambda: (voltages(peer)[-1] == 0.0) is (level == "2"), what="the voltage that goes with it"
-        )
+        status = sensors.until(lambda s: (voltages(peer)[-1] == 0.0) is (level == "2"), "the voltage with it")
+        assert status["state_timeouts"] == "0"
         peer.until(lambda: said in node.output, what="the reason in the log")
         sensors.position, sensors.current, sensors.reference = 1.0, 0.1, 5.0
         sensors.until(drives, "all well again")
-        peer.until(lambda: voltages(peer)[-1] > 0.0, what="a voltage that moves")
+        sensors.until(lambda s: voltages(peer)[-1] > 0.0, "a voltage that moves")
+
+
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    (
+        ({"current": 200.0}, "motor/current of 200 A is beyond what this hand has, 24.2 A: in A? 0 V"),
+        (
+            {"position": 57.3},
+            "position of motor/state of 57.3 rad is beyond what this hand has, -15.6 .. 31.2 rad",
+        ),
+    ),
+)
+def test_readings_that_no_hand_gives_switch_the_motor_off(peer, bad, said):
+    """In mA or degrees: at 0 V the hand soon draws little enough to be believed, and would be driven again."""
+    peer.hear("motor_voltage")
+    peer.hear_diagnostics()
+    sensors = Sensors(peer)
+    with processes(NodeProcess(NAME, **Sensors.patient)) as (node,):
+        announce(peer)
+        sensors.until(drives, "a driven motor")
+        for name, value in bad.items():
+            setattr(sensors, name, value)
+        sensors.until(lambda s: "not active: motor off; activate again" in s["message"], "the motor off")
+        peer.until(
+            lambda: said in node.output and "readings that no hand gives" in node.output, what="the log"
+        )
+        sensors.position, sensors.current = 1.0, 0.1
+        before = len(voltages(peer))
+        status = sensors.until(lambda s: "beyond what" not in s["message"], "good readings")
+        assert status["active"] == "False" and status["trips"] == "1"
+        assert not any(voltages(peer)[before:])
 
 
 @pytest.mark.parametrize(("ahead", "said"), ((-60.0, " s before "), (60.0, " s after ")))

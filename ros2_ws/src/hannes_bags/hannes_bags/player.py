@@ -122,12 +122,9 @@ class Schedule:
         """Simulated time (ns) after `elapsed` s of playing."""
         return self.first_ns + round(elapsed * self._rate * 1e9)
 
-    def due(
-        self, elapsed: float, at_most: int = 1000, until: float = math.inf
-    ) -> list[tuple[int, tuple[tuple[str, bytes], ...]]]:
-        """The ticks (simulated time ns, messages) that are due after `elapsed` s, at most so many at once, and none
-        later than `until` s of the bag."""
-        now = min(self._due_until(elapsed), self.first_ns + until * 1e9)
+    def due(self, elapsed: float, at_most: int = 1000) -> list[tuple[int, tuple[tuple[str, bytes], ...]]]:
+        """The ticks (simulated time ns, messages) that are due after `elapsed` s, at most so many at once."""
+        now = self._due_until(elapsed)
         ticks: list[tuple[int, tuple[tuple[str, bytes], ...]]] = []
         while self._next is not None and len(ticks) < at_most:
             log_ns, messages = self._next
@@ -142,12 +139,9 @@ class Schedule:
                 self._next = next(self._ticks, None)
         return ticks
 
-    def held(self, elapsed: float, until: float) -> bool:
-        """Whether a tick is due after `elapsed` s that is later than `until` s of the bag."""
-        if self._next is None:
-            return False
-        at = self._next[0] + self._shift
-        return self.first_ns + until * 1e9 < at <= self._due_until(elapsed)
+    def is_due(self, elapsed: float) -> bool:
+        """Whether a tick is due after `elapsed` s."""
+        return self._next is not None and self._next[0] + self._shift <= self._due_until(elapsed)
 
     def _due_until(self, elapsed: float) -> float:
         return math.inf if self._rate == 0.0 else self.time_at(elapsed)

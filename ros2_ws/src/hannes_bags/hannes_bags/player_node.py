@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from dataclasses import dataclass
 from time import monotonic
@@ -20,7 +19,6 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
-from .cdr import stamp_at
 from .player import Schedule, load_playlist
 from .recorder_node import message_class
 from .storage import TopicEntry
@@ -32,8 +30,11 @@ _FAST_TICKS = 5
 """Distinct times a step in fast mode, so 5000 a second. DDS has no back pressure on readers that keep the last n, and
 acknowledgements come with heartbeats, every 3 s: what bounds the speed is what a Python subscriber can take."""
 _TICKS_AT_ONCE = 1000
-_LEAD_S = 0.2
-"""s by which commands may be ahead of the hand that answers them tick by tick: it keeps a second of them."""
+_LEAD = 200
+"""Commands by which the player may be ahead of a hand in lock-step, which answers each once: it keeps a thousand."""
+_STOOD_S = 1.0
+"""A hand that has stood for so long has answered what it got, though not all of its /clock was heard."""
+_LEAST_PATIENCE_S = 5.0
 _ARRIVAL_S = 3.5
 _LOOK_S = 0.1
 _QUIET_S, _LONGEST_S = 0.5, 3.0
@@ -83,11 +84,12 @@ class PlayerNode(HannesNode, Node):
         self._schedule = Schedule(playlist, 0.0 if p.fast else p.rate, loop=p.loop)
         self._topics = playlist.topics
         # A hand in lock-step takes one command for each tick, and tells the time.
-        voltage = self.resolve_topic_name(topics.signal("motor_voltage").topic)
-        self._follows = not p.clock and voltage in {entry.name for entry in playlist.topics}
-        self._hand: tuple[int, int] | None = None
-        self._hand_at = 0.0
-        self._told = False
+        self._voltage = self.resolve_topic_name(topics.signal("motor_voltage").topic)
+        self._follows = not p.clock and self._voltage in {entry.name for entry in playlist.topics}
+        self._in_step = False
+        self._sent = self._answered = 0
+        self._rebased_at = -1
+        self._answered_at = 0.0
         self._sim_clock: Publisher | None = None
         self._outputs: dict[str, Publisher] = {}
         self._began: float | None = None
@@ -109,8 +111,7 @@ class PlayerNode(HannesNode, Node):
         if self._p.clock:
             self._sim_clock = topics.clock_publisher(self)
         if self._follows:
-            newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-            self.create_subscription(Clock, topics.CLOCK_TOPIC, self._on_clock, newest, raw=True)
+            self.create_subscription(Clock, topics.CLOCK_TOPIC, self._on_clock, topics.CLOCK_QOS, raw=True)
         self._outputs = {entry.name: self._publisher(entry) for entry in self._topics}
         self._opened = self._changed = monotonic()
 
@@ -131,14 +132,17 @@ class PlayerNode(HannesNode, Node):
             return
         now = monotonic()
         elapsed = now - (self._began or now)
-        until = self._until()
-        if self._schedule.held(elapsed, until):
-            self._stands(until)
-        ticks = self._schedule.due(elapsed, _FAST_TICKS if self._p.fast else _TICKS_AT_ONCE, until)
+        at_most = _FAST_TICKS if self._p.fast else _TICKS_AT_ONCE
+        if self._in_step:
+            at_most = min(at_most, self._room())
+            if not at_most and self._schedule.is_due(elapsed):
+                self._stands(now)
+        ticks = self._schedule.due(elapsed, at_most)
         for stamp_ns, messages in ticks:
             self._tell_time(stamp_ns, now)
             for topic, data in messages:
                 self._outputs[topic].publish(data)
+                self._sent += topic == self._voltage
             self._count += len(messages)
         if not self._p.fast and now - self._clocked > _CLOCK_S and not self._schedule.done:
             self._tell_time(self._schedule.time_at(elapsed), now)
@@ -146,23 +150,34 @@ class PlayerNode(HannesNode, Node):
             self.done = True
 
     def _on_clock(self, data: bytes) -> None:
-        now = stamp_at(data)
-        if now is not None:
-            self._hand, self._hand_at = (self._hand[0] if self._hand else now, now), monotonic()
+        """A tick of the hand in lock-step: one command is answered."""
+        if self._began is not None:
+            self._answered += 1
+            self._answered_at = monotonic()
 
-    def _until(self) -> float:
-        """Up to which time of the bag [s] may be played: a hand in lock-step must keep up, or commands are lost."""
-        if not self._follows or not self._told:
-            return math.inf
-        return _LEAD_S + (0.0 if self._hand is None else (self._hand[1] - self._hand[0]) * 1e-9)
+    def _room(self) -> int:
+        """How many commands may be sent: more than the hand keeps would be lost without a word."""
+        return max(0, self._answered + _LEAD - self._sent)
 
-    def _stands(self, until: float) -> None:
-        """End where the hand has not gone on for `wait` seconds."""
-        if monotonic() - max(self._hand_at, self._began or 0.0) > self._p.wait:
+    def _stands(self, now: float) -> None:
+        """The hand stands though it was sent enough: go on once, as some of its /clock may be unheard, then end."""
+        since = now - max(self._answered_at, self._began or 0.0)
+        if since > _STOOD_S and self._answered > self._rebased_at:
+            self._answered = self._rebased_at = self._sent
+        elif since > max(self._p.wait, _LEAST_PATIENCE_S):
             self.fail(
-                f"The hand that takes {topics.signal('motor_voltage').topic} in lock-step has stood for "
-                f"{self._p.wait:g} s, at {until - _LEAD_S:.3f} s of the bag: see `hannes nodes` for what it waits for."
+                f"The hand that takes {topics.signal('motor_voltage').topic} in lock-step has stood for {since:.0f} s, "
+                f"after {self._sent} commands: see `hannes nodes` for what it waits for."
             )
+
+    def _one_in_step(self) -> bool:
+        """Whether the node that tells the time is the hand: then it answers commands tick by tick."""
+        state = self.resolve_topic_name(topics.signal("encoder_position").topic)
+        of_clock, of_state = (
+            {(i.node_namespace, i.node_name) for i in self.get_publishers_info_by_topic(name)}
+            for name in (topics.CLOCK_TOPIC, state)
+        )
+        return bool(of_clock & of_state)
 
     def _ready(self) -> bool:
         """Whether nobody else publishes the topics and each has its subscribers; the time of playing begins then."""
@@ -199,7 +214,7 @@ class PlayerNode(HannesNode, Node):
 
     def _look(self) -> None:
         """Whether the graph still changes; while it plays, whether somebody else began to."""
-        self._told = self._follows and self.count_publishers(topics.CLOCK_TOPIC) > 0
+        self._in_step = self._follows and self._one_in_step()
         if self._began is None:
             listeners = [output.get_subscription_count() for output in self._outputs.values()]
             seen = len(self.get_node_names()), listeners, self._others()

@@ -177,8 +177,8 @@ def _told_of_a_run(reports: Sequence[str]) -> str:
     if not bad:
         return ""
     return (
-        f"in {len(bad)} of its {len(reports)} reports the controller said that its loop was disturbed (the last of "
-        f'them: "{bad[-1]}"): a model has no such loop, and what is recorded may differ from it for that'
+        f"in {len(bad)} of its {len(reports)} reports the controller told of an error (the last of them: "
+        f'"{bad[-1]}"): a model knows of none, and what is recorded may differ from it for that'
     )
 
 

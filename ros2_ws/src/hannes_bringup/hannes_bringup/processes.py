@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from types import FrameType, TracebackType
 
 from hannes_description.errors import HannesError
@@ -65,7 +66,7 @@ class ProcessGroup:
                 env=None if self.environment is None else dict(self.environment),
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
-                preexec_fn=_end_with_parent,
+                preexec_fn=partial(_end_with, os.getpid()),
             )
         except OSError as error:
             raise HannesError(f"Cannot start '{name}' ({command[0]}): {error.strerror}.") from error
@@ -119,13 +120,17 @@ class ProcessGroup:
 
 
 _PR_SET_PDEATHSIG = 1
-_library = ctypes.CDLL(None)
+# looked up here: between fork and exec nothing may be
+_prctl = getattr(ctypes.CDLL(None), "prctl", None)
+_SIGINT = int(signal.SIGINT)
 
 
-def _end_with_parent() -> None:
+def _end_with(parent: int) -> None:
     """In a child, before its program begins: SIGINT when the parent dies (Linux; elsewhere nothing happens)."""
-    if hasattr(_library, "prctl"):
-        _library.prctl(_PR_SET_PDEATHSIG, int(signal.SIGINT), 0, 0, 0)
+    if _prctl is not None:
+        _prctl(_PR_SET_PDEATHSIG, _SIGINT, 0, 0, 0)
+        if os.getppid() != parent:
+            os._exit(0)  # it died before
 
 
 class Interrupted(Exception):
@@ -150,7 +155,8 @@ def raise_on_signals() -> None:
             # Nobody reads any more, and a write to a closed terminal is an error in the midst of stopping.
             nowhere = os.open(os.devnull, os.O_WRONLY)
             for stream in (1, 2):
-                os.dup2(nowhere, stream)
+                if os.isatty(stream):
+                    os.dup2(nowhere, stream)
         raise Interrupted(signal.Signals(number).name)
 
     for number in numbers:

@@ -32,6 +32,9 @@ _PATIENCE_S = 2.0
 _ANOTHER_CLOCK_S = 0.5
 """Stamps that are so far off, or for so long without a good one between, are of another clock; others are late."""
 _SAY_AGAIN_S = 5.0
+_MOST_IMPOSSIBLE = 10
+"""Readings since the activation that no hand gives, from which on the motor is off: at 0 V a hand that tells mA
+soon draws little enough to be believed again."""
 _STALLED = 3.0
 """Multiples of the current of the stalled motor above which a reading is none: driven backwards at full speed it draws
 twice that."""
@@ -127,6 +130,7 @@ class MotorController(HannesNode, LifecycleNode):
         )
         self._lockstep = p.clock == "lockstep"
         self._active = self._tripped = False
+        self._impossible = 0
         self._health = Health(
             "rejected_states",
             "rejected_inputs",
@@ -212,7 +216,7 @@ class MotorController(HannesNode, LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Motor on, from a cleared controller."""
         self._clear()
-        self._active, self._tripped = True, False
+        self._active, self._tripped, self._impossible = True, False, 0
         if self._lockstep:
             if self._join.synchronised:
                 self._answer()
@@ -311,6 +315,7 @@ class MotorController(HannesNode, LifecycleNode):
             self._health.faults.good(f"{name}, its range")
             return
         self._health.count("rejected_inputs")
+        self._impossible += 1
         self._health.faults.bad(
             f"{name}, its range", ERROR, f"{name} of {value} is beyond what this hand has, {most} 0 V"
         )
@@ -518,7 +523,16 @@ class MotorController(HannesNode, LifecycleNode):
             self._answer()
         if self._loop is not None and self._loop.error is not None:
             self.fail(f"The control loop stopped: {self._loop.error!r}")
-        if self._tripped and self._active:
+        if self._impossible >= _MOST_IMPOSSIBLE and self._active and not self._lockstep:
+            self._tripped = True
+            self._health.count("trips")
+            self.get_logger().error(
+                f"{self._impossible} readings that no hand gives: motor off; mend what the board sends, and activate "
+                "the node again"
+            )
+            self.trigger_deactivate()
+            self._diagnostics.publish()
+        elif self._tripped and self._active:
             self._health.count("trips")
             self.get_logger().error(
                 f"the control loop paused for more than {self._p.pause_limit_ms:g} ms: motor off; "

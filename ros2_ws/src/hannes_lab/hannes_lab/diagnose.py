@@ -75,6 +75,9 @@ FORETOLD = 0.25
 """Part of the mean square error on closures or on conditions that were left out, that an effect must remove where the
 rest explains all and no model has the machine's form.  A wrong one bends the fit to its own data."""
 
+FEW_CONDITIONS = 3
+"""Of so many one that is left out opens most intervals."""
+
 NEEDED = 2.0
 """So many times the error with an effect, or what chance makes of it, without it on closures and on conditions that
 were left out: then it is named also where its intervals hold nought."""
@@ -303,16 +306,17 @@ def _borne_out(choice: Choice, null: Candidate, falls: tuple[Fall, ...]) -> tupl
         notes += (f"{best.names[-1]} joined too, but {why}: it is left out",)
         falls, alone = falls[:-1], True
         best = search.with_spread(search.fit_of(best.names[:-1]))
-    if best.names and _may_be_nought(search, best, spans_of(search, best, limits, falls)):
-        notes += (_needed_sentence(best.names[-1], falls),)
-        choice = replace(choice, notes=notes)
     deciding = deciding_errors(falls)
     first = before(deciding)
-    if not alone and (first == NOMINAL_FITTED or not best.names):
-        return choice, falls
     if alone:
         choice = replace(choice, best=best, rivals=(), notes=notes)
-    return judged_by_conditions(choice, null, deciding[first], deciding[-1]), falls
+    if alone or (first != NOMINAL_FITTED and best.names):
+        choice = judged_by_conditions(choice, null, deciding[first], deciding[-1])
+    named = best.names and (choice.adequate or choice.enough)
+    if named and _may_be_nought(search, best, spans_of(search, best, limits, falls)):
+        few = len(search.problem.features.conditions) <= FEW_CONDITIONS
+        choice = replace(choice, notes=(*choice.notes, _needed_sentence(best.names[-1], falls, few)))
+    return choice, falls
 
 
 def _idle_at_the_end(
@@ -350,13 +354,15 @@ def _is_needed(falls: Sequence[Fall]) -> bool:
     return all(e[-2] >= NEEDED * max(e[-1], 1.0) for e in measures)
 
 
-def _needed_sentence(name: str, falls: Sequence[Fall]) -> str:
+def _needed_sentence(name: str, falls: Sequence[Fall], few: bool) -> str:
     """Why an effect is named of which the intervals hold nought."""
     left_out, conditions = left_out_errors(falls)[-2:], [f.held_out_conditions for f in falls[-2:]]
+    hardly = ", since few conditions hardly tell it" if few else ""
+    more = ": record more conditions" if few else ""
     return (
-        f"{name}: its 95 % intervals hold nought, since few conditions hardly tell it; it is named "
-        f"because without it the error is {left_out[0]:.3g} instead of {left_out[1]:.3g} on closures and "
-        f"{conditions[0]:.3g} instead of {conditions[1]:.3g} on conditions that were left out: record more conditions"
+        f"{name}: its 95 % intervals hold nought{hardly}; it is named because without it the error is "
+        f"{left_out[0]:.3g} instead of {left_out[1]:.3g} on closures and {conditions[0]:.3g} instead of "
+        f"{conditions[1]:.3g} on conditions that were left out{more}"
     )
 
 

@@ -165,7 +165,7 @@ def without_outliers(trial: Trial) -> Trial:
             # What the others are simulated as stays: the most typical recording of those that begin anew.
             needed = trial.anew and closure.start < trial.parts[1].begin
             (dropped if far > OUTLIER and not needed else kept).append(closure)
-        if closures[0] in kept and distance[0] > FIRST_APART:
+        if closures[0] in kept and FIRST_APART < distance[0] <= OUTLIER:
             of = f" of '{condition}'" if len(trial.conditions) > 1 else ""
             said.append(
                 f"the first closure{of} is {distance[0]:.1f} times as far from the median closure as half of them are: "

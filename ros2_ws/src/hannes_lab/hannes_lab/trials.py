@@ -61,7 +61,10 @@ SHORT = 2.5
 """Steps of a signal without a sample from which it is said to miss some in a closure that is unlike the others."""
 
 HOLDS = 0.5
-"""s for which the last value of a reference holds at least."""
+"""s for which the last value of a reference holds at least, where its source ended."""
+
+CUT = 0.1
+"""s at the end of a recording of which it is said that they are left out."""
 
 FOLLOWED = 0.25
 """Part of the reference's span that an encoder goes over in a gap of it where there was something to follow."""
@@ -586,7 +589,13 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     _check_overlap(recording)
     origin = float(channel.time[0])
     origin = math.floor(origin / period + 1e-6) * period
-    duration = min(recording.end, _known_until(channel.time)) - origin
+    end = min(recording.end, _known_until(np.asarray(channel.time), np.asarray(channel.values, dtype=float)))
+    if recording.end - end > CUT:
+        notes.append(
+            f"the reference ends {recording.end - end:.1f} s before the recording does, away from its rest: what comes "
+            "after is left out"
+        )
+    duration = end - origin
     samples = {
         s: (np.asarray(c.time) - origin, np.asarray(c.values, dtype=float))
         for s, c in recording.channels.items()
@@ -643,9 +652,15 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     )
 
 
-def _known_until(time: Array) -> float:
-    """Until when [s] a reference is known that was logged at these times: its last value holds for as long as one did
-    before, or HOLDS.  After that its source has ended, and where it stood then is no rest."""
+def _known_until(time: Array, values: Array) -> float:
+    """Until when [s] a reference (n,) is known that was logged at these times (n,).
+
+    Its last value holds on.  Where it is away from rest its source has ended in the midst of a closure, and where it
+    stood then is no rest: it holds for as long as one did before, or HOLDS.
+    """
+    near = RESTS * float(np.ptp(values))
+    if min(abs(values[-1] - rest) for rest in (values[0], _rest_value(values))) <= near:
+        return math.inf
     return float(time[-1]) + max(HOLDS, float(np.diff(time).max(initial=0.0)))
 
 
