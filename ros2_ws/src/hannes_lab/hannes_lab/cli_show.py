@@ -171,7 +171,11 @@ def _show_falls(console: Console, found: Diagnosis | Addition, machine: str) -> 
         )
     show_table(table, TEXT_WIDTH)
     if signals:
-        console.print("The last columns: error of each signal on held-out conditions.", style="dim")
+        console.print(
+            "The last columns: error of each signal on held-out conditions. Closures: root mean square of all ratios; "
+            "conditions: of each signal the error over all against the repeatability over all.",
+            style="dim",
+        )
     _show_conditions(found.falls)
 
 
