@@ -289,7 +289,7 @@ def test_states_without_a_stamp_are_rejected_and_said(peer):
     with processes(NodeProcess(NAME, **Sensors.patient)):
         announce(peer)
         peer.say("encoder_position", state_bytes(0, 1.0))
-        said = "motor/state is rejected: no stamp by the clock of this machine"
+        said = "motor/state is rejected: its header has no stamp; set it by the clock of this machine"
         peer.until_status(NAME, lambda s: said in s["message"], "the reason")
 
 

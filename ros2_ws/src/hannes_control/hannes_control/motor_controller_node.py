@@ -387,12 +387,11 @@ class MotorController(HannesNode, LifecycleNode):
             clock = "/clock (use_sim_time)"
         else:
             clock = "the clock of this machine (for a played bag set use_sim_time)"
-        off = (
-            f"it is stamped {abs(age):.3g} s {'before' if age > 0.0 else 'after'}"
-            if stamp_ns
-            else "no stamp by"
-        )
-        return f"{off} {clock}; {self._p.state_timeout_ms / 1e3:g} s are allowed"
+        if not stamp_ns:
+            return f"its header has no stamp; set it by {clock}"
+        side = "before" if age > 0.0 else "after"
+        allowed = self._p.state_timeout_ms / 1e3
+        return f"it is stamped {abs(age):.3g} s {side} {clock}; {allowed:g} s are allowed"
 
     def _on_current(self, data: bytes) -> None:
         self._current, self._current_at = self._decode_current(data), monotonic()
