@@ -17,7 +17,6 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosgraph_msgs.msg import Clock
 
 from .player import Schedule, load_playlist
 from .recorder_node import message_class
@@ -111,7 +110,7 @@ class PlayerNode(HannesNode, Node):
         if self._p.clock:
             self._sim_clock = topics.clock_publisher(self)
         if self._follows:
-            self.create_subscription(Clock, topics.CLOCK_TOPIC, self._on_clock, topics.CLOCK_QOS, raw=True)
+            topics.clock_subscription(self, self._on_clock)
         self._outputs = {entry.name: self._publisher(entry) for entry in self._topics}
         self._opened = self._changed = monotonic()
 

@@ -96,6 +96,11 @@ def clock_publisher(node: Node, on_match: Callable[[Any], None] | None = None) -
     return node.create_publisher(Clock, CLOCK_TOPIC, CLOCK_QOS, event_callbacks=events)
 
 
+def clock_subscription(node: Node, callback: Callable[[bytes], None]) -> Subscription:
+    """Subscription of simulated time that hands over serialised messages."""
+    return node.create_subscription(Clock, CLOCK_TOPIC, callback, CLOCK_QOS, raw=True)
+
+
 def diagnostics_publisher(node: Node) -> Publisher:
     """Publisher of the node's health."""
     return node.create_publisher(DiagnosticArray, DIAGNOSTICS_TOPIC, DIAGNOSTICS_QOS)
