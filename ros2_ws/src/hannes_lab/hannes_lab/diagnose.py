@@ -78,6 +78,9 @@ rest explains all and no model has the machine's form.  A wrong one bends the fi
 FEW_CONDITIONS = 3
 """Of so many one that is left out opens most intervals."""
 
+HOLD_NOUGHT = "its 95 % intervals hold nought"
+"""Said of an effect that is named in spite of that, before all else that is to be known of an answer."""
+
 NEEDED = 2.0
 """So many times the error with an effect, or what chance makes of it, without it on closures and on conditions that
 were left out: then it is named also where its intervals hold nought."""
@@ -206,8 +209,9 @@ def diagnose(
         notes=(
             *((pointer,) if pointer else ()),
             *lost,
+            *(note for note in choice.notes if HOLD_NOUGHT in note),
             *prepared.notes,
-            *choice.notes,
+            *(note for note in choice.notes if HOLD_NOUGHT not in note),
             *((choice.left,) if choice.left and not unknown else ()),
             *notes(search, best, verdict, effects, experiments, greedy, clock),
             *(lead(choice, falls) if verdict == "effects" else ()),
@@ -360,7 +364,7 @@ def _needed_sentence(name: str, falls: Sequence[Fall], few: bool) -> str:
     hardly = ", since few conditions hardly tell it" if few else ""
     more = ": record more conditions" if few else ""
     return (
-        f"{name}: its 95 % intervals hold nought{hardly}; it is named because without it the error is "
+        f"{name}: {HOLD_NOUGHT}{hardly}; it is named because without it the error is "
         f"{left_out[0]:.3g} instead of {left_out[1]:.3g} on closures and {conditions[0]:.3g} instead of "
         f"{conditions[1]:.3g} on conditions that were left out{more}"
     )
