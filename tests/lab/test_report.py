@@ -623,22 +623,21 @@ def test_an_effect_that_explains_most_and_foretells_nothing_is_named_in_a_note()
     rank = Rank(("cogging",), 10.0, 14.0, 0.91)
 
     def told(
-        explained: float, names: tuple[str, ...] = (), repeated: bool = True, notes: tuple[str, ...] = ()
+        explained: float, names: tuple[str, ...] = (), repeated: bool = True, taken_back: tuple[str, ...] = ()
     ) -> tuple[str, ...]:
         features = SimpleNamespace(repeated=repeated)
         choice = SimpleNamespace(
             ranking=(Rank(("gravity",), 90.0, 94.0, 0.0), replace(rank, explained=explained)),
             best=SimpleNamespace(names=names),
             search=SimpleNamespace(problem=SimpleNamespace(features=features)),
-            notes=notes,
+            taken_back=taken_back,
         )
         return unforetold(choice)
 
     (note,) = told(0.91)
     assert note.startswith("cogging alone explains 91 %") and "hannes add --effect cogging" in note
     assert not told(0.3) and not told(0.91, ("cogging",)) and not told(0.91, repeated=False)
-    dropped = "cogging joined too, but by its 95 % intervals its strength may be nought: it is left out"
-    assert not told(0.91, notes=(dropped,)), "there it foretold better"
+    assert not told(0.91, taken_back=("cogging",)), "there it foretold better"
 
 
 def test_overlays_of_the_same_condition_keep_their_counterparts() -> None:

@@ -13,6 +13,7 @@ from functools import partial
 from types import FrameType, TracebackType
 
 from hannes_description.errors import HannesError
+from hannes_ros.early import ending_signals
 
 GRACE_SIGINT = 5.0
 """s that a process has after SIGINT before it gets SIGTERM (upstream launch: 5 s)."""
@@ -24,7 +25,7 @@ POLL = 0.05
 QUIET_FROM_THE_START = (
     "import os, signal, sys\n"
     "for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):\n"
-    "    if signal.getsignal(number) != signal.SIG_IGN:\n"
+    "    if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:\n"
     "        signal.signal(number, lambda *_: os._exit(0))\n"
     "signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])\n"
 )
@@ -142,11 +143,7 @@ def raise_on_signals() -> None:
 
     A SIGHUP that is ignored (`nohup`) stays so.
     """
-    numbers = [
-        number
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN
-    ]
+    numbers = ending_signals()
 
     def handler(number: int, frame: FrameType | None) -> None:
         for each in numbers:

@@ -12,7 +12,7 @@ from hannes_description.errors import HannesError
 from hannes_description.joints import RAD_PER_COUNT
 from hannes_description.model import Model
 from hannes_ros import convert, topics
-from hannes_ros.diagnostics import ERROR, OK, WARN, Arrivals, Diagnostics, Health, silence
+from hannes_ros.diagnostics import ERROR, OK, SAY_AGAIN_S, WARN, Arrivals, Diagnostics, Health, silence
 from hannes_ros.lockstep import SETTLE_S, Peers, Probe, TickJoin
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
@@ -31,7 +31,6 @@ _PATIENCE_S = 2.0
 """s for which an input may be waited for without a word in the log."""
 _ANOTHER_CLOCK_S = 0.5
 """Stamps that are so far off, or for so long without a good one between, are of another clock; others are late."""
-_SAY_AGAIN_S = 5.0
 _MOST_IMPOSSIBLE = 10
 """Readings since the activation that no hand gives, from which on the motor is off: at 0 V a hand that tells mA
 soon draws little enough to be believed again."""
@@ -506,7 +505,7 @@ class MotorController(HannesNode, LifecycleNode):
     def _check(self) -> None:
         stale = self._active and self._stale
         if stale and not self._said_stale:
-            self.get_logger().error(TOO_OLD, throttle_duration_sec=_SAY_AGAIN_S)
+            self.get_logger().error(TOO_OLD, throttle_duration_sec=SAY_AGAIN_S)
         self._said_stale = stale
         if self._lockstep and self._probe.over() and self._join.synchronised:
             if (left_over := self._join.left_over) is not None:
@@ -524,21 +523,20 @@ class MotorController(HannesNode, LifecycleNode):
             self.fail(f"The control loop stopped: {self._loop.error!r}")
         if self._impossible >= _MOST_IMPOSSIBLE and self._active and not self._lockstep:
             self._tripped = True
-            self._health.count("trips")
-            self.get_logger().error(
-                f"{self._impossible} readings that no hand gives: motor off; mend what the board sends, and activate "
-                "the node again"
+            self._switch_off(
+                f"{self._impossible} readings that no hand gives: motor off; mend what the board sends"
             )
-            self.trigger_deactivate()
-            self._diagnostics.publish()
         elif self._tripped and self._active:
-            self._health.count("trips")
-            self.get_logger().error(
-                f"the control loop paused for more than {self._p.pause_limit_ms:g} ms: motor off; "
-                "activate the node again"
+            self._switch_off(
+                f"the control loop paused for more than {self._p.pause_limit_ms:g} ms: motor off"
             )
-            self.trigger_deactivate()
-            self._diagnostics.publish()
+
+    def _switch_off(self, why: str) -> None:
+        """The motor off until somebody activates the node again."""
+        self._health.count("trips")
+        self.get_logger().error(f"{why}; activate the node again")
+        self.trigger_deactivate()
+        self._diagnostics.publish()
 
     def _state_rate(self) -> str:
         """Rate of motor/state; in real time too low a one is a fault."""

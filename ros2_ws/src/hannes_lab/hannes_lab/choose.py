@@ -77,6 +77,7 @@ class Choice:
     left     a sentence on what a greedy choice leaves, where something is
     other_model  that is no more than the machine repeats, but with a model that is not believed
     excluded effects that are not looked for
+    taken_back effects that joined a greedy search, and are none all the same
     """
 
     search: Search
@@ -91,6 +92,7 @@ class Choice:
     left: str = ""
     other_model: bool = False
     excluded: tuple[str, ...] = ()
+    taken_back: tuple[str, ...] = ()
 
     @property
     def sought(self) -> list[str]:

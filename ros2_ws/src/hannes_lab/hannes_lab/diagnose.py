@@ -78,9 +78,6 @@ rest explains all and no model has the machine's form.  A wrong one bends the fi
 FEW_CONDITIONS = 3
 """Of so many one that is left out opens most intervals."""
 
-HOLD_NOUGHT = "its 95 % intervals hold nought"
-"""Said of an effect that is named in spite of that, before all else that is to be known of an answer."""
-
 NEEDED = 2.0
 """So many times the error with an effect, or what chance makes of it, without it on closures and on conditions that
 were left out: then it is named also where its intervals hold nought."""
@@ -164,6 +161,10 @@ def diagnose(
     intervals = spans_of(search, best, limits, falls)
     effects = found_effects(search, best, intervals, falls)
     unknown = verdict == "unknown"
+    needed: tuple[str, ...] = ()
+    if greedy and verdict == "effects" and _may_be_nought(search, best, intervals):
+        few = len(prepared.features.conditions) <= FEW_CONDITIONS
+        needed = (_needed_sentence(best.names[-1], falls, few),)
     clock = other_clock(search.problem, best.fit) if greedy or unknown else None
     lost = unforetold(choice) if greedy and unknown else ()
     kind = unknown_kind(search, effects, choice, answer.bent, only, bool(lost)) if unknown else ""
@@ -209,9 +210,9 @@ def diagnose(
         notes=(
             *((pointer,) if pointer else ()),
             *lost,
-            *(note for note in choice.notes if HOLD_NOUGHT in note),
+            *needed,
             *prepared.notes,
-            *(note for note in choice.notes if HOLD_NOUGHT not in note),
+            *choice.notes,
             *((choice.left,) if choice.left and not unknown else ()),
             *notes(search, best, verdict, effects, experiments, greedy, clock),
             *(lead(choice, falls) if verdict == "effects" else ()),
@@ -305,22 +306,19 @@ def _borne_out(choice: Choice, null: Candidate, falls: tuple[Fall, ...]) -> tupl
     """
     search, limits, notes = choice.search, choice.limits, choice.notes
     best = search.with_spread(choice.best)
-    alone = False
+    alone, taken_back = False, tuple[str, ...]()
     while best.names and (why := _idle_at_the_end(search, best, limits, falls, alone)):
         notes += (f"{best.names[-1]} joined too, but {why}: it is left out",)
+        taken_back += best.names[-1:]
         falls, alone = falls[:-1], True
         best = search.with_spread(search.fit_of(best.names[:-1]))
     deciding = deciding_errors(falls)
     first = before(deciding)
+    if not alone and (first == NOMINAL_FITTED or not best.names):
+        return choice, falls
     if alone:
-        choice = replace(choice, best=best, rivals=(), notes=notes)
-    if alone or (first != NOMINAL_FITTED and best.names):
-        choice = judged_by_conditions(choice, null, deciding[first], deciding[-1])
-    named = best.names and (choice.adequate or choice.enough)
-    if named and _may_be_nought(search, best, spans_of(search, best, limits, falls)):
-        few = len(search.problem.features.conditions) <= FEW_CONDITIONS
-        choice = replace(choice, notes=(*choice.notes, _needed_sentence(best.names[-1], falls, few)))
-    return choice, falls
+        choice = replace(choice, best=best, rivals=(), notes=notes, taken_back=taken_back)
+    return judged_by_conditions(choice, null, deciding[first], deciding[-1]), falls
 
 
 def _idle_at_the_end(
@@ -364,7 +362,7 @@ def _needed_sentence(name: str, falls: Sequence[Fall], few: bool) -> str:
     hardly = ", since few conditions hardly tell it" if few else ""
     more = ": record more conditions" if few else ""
     return (
-        f"{name}: {HOLD_NOUGHT}{hardly}; it is named because without it the error is "
+        f"{name}: its 95 % intervals hold nought{hardly}; it is named because without it the error is "
         f"{left_out[0]:.3g} instead of {left_out[1]:.3g} on closures and {conditions[0]:.3g} instead of "
         f"{conditions[1]:.3g} on conditions that were left out{more}"
     )

@@ -165,23 +165,23 @@ def without_outliers(trial: Trial) -> Trial:
             # What the others are simulated as stays: the most typical recording of those that begin anew.
             needed = trial.anew and closure.start < trial.parts[1].begin
             (dropped if far > OUTLIER and not needed else kept).append(closure)
-        if closures[0] in kept and FIRST_APART < distance[0] <= OUTLIER:
+        if FIRST_APART < distance[0] <= OUTLIER:
             of = f" of '{condition}'" if len(trial.conditions) > 1 else ""
             said.append(
                 f"the first closure{of} is {distance[0]:.1f} times as far from the median closure as half of them are: "
                 f"it stays (from {OUTLIER:g} times on it is left out), counts as scatter, and errors look small "
                 "against that"
             )
-    if not dropped:
-        return replace(trial, notes=(*trial.notes, *said)) if said else trial
-    several = len(trial.conditions) > 1
-    note = f"{len(dropped)} closure(s) far from the others are left out, starting at " + ", ".join(
-        f"{max(c.start, 0.0):.1f} s{f' ({c.condition})' if several else ''}{_missing(trial, c)}"
-        for c in dropped
-    )
-    return replace(
-        trial, closures=tuple(sorted(kept, key=lambda c: c.start)), notes=(*trial.notes, note, *said)
-    )
+    if dropped:
+        several = len(trial.conditions) > 1
+        note = f"{len(dropped)} closure(s) far from the others are left out, starting at " + ", ".join(
+            f"{max(c.start, 0.0):.1f} s{f' ({c.condition})' if several else ''}{_missing(trial, c)}"
+            for c in dropped
+        )
+        said.insert(0, note)
+    if not said:
+        return trial
+    return replace(trial, closures=tuple(sorted(kept, key=lambda c: c.start)), notes=(*trial.notes, *said))
 
 
 def _missing(trial: Trial, closure: Closure) -> str:

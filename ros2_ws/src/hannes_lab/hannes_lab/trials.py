@@ -589,18 +589,18 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     _check_overlap(recording)
     origin = float(channel.time[0])
     origin = math.floor(origin / period + 1e-6) * period
-    end = min(recording.end, _known_until(np.asarray(channel.time), np.asarray(channel.values, dtype=float)))
-    if recording.end - end > CUT:
-        notes.append(
-            f"the reference ends {recording.end - end:.1f} s before the recording does, away from its rest: what comes "
-            "after is left out"
-        )
-    duration = end - origin
     samples = {
         s: (np.asarray(c.time) - origin, np.asarray(c.values, dtype=float))
         for s, c in recording.channels.items()
     }
     logged = samples.pop("reference_position")
+    whole_length = recording.end - origin
+    duration = min(whole_length, _known_until(*logged))
+    if whole_length - duration > CUT:
+        notes.append(
+            f"the reference ends {whole_length - duration:.1f} s before the recording does, away from its rest: what "
+            "comes after is left out"
+        )
     reference, note = reference_on_grid(*logged, period, duration, hold_rate(meta, recording.source))
     if note:
         notes.append(note if "reference_held" in meta else f"{note} {OR_ELSE}")

@@ -276,9 +276,9 @@ def unforetold(choice: Choice) -> tuple[str, ...]:
     known = choice.search.problem.features.repeated
     if first is None or choice.best.names or not known or first.explained < MOST:
         return ()
+    if first.names[0] in choice.taken_back:
+        return ()  # with it they were foretold better
     names = " + ".join(first.names)
-    if any(note.startswith(f"{first.names[0]} joined too") for note in choice.notes):
-        return ()
     return (
         f"{names} alone explains {100 * first.explained:.0f} % of the excess misfit of a fit to all conditions, but "
         "those that were left out of a fit are foretold no better with it: they may be too unlike to foretell one "
