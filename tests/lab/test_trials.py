@@ -397,6 +397,24 @@ def test_grouping_ignores_small_differences_only() -> None:
     assert len(spans) == 4 and len(kinds) == 2
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5), (4, 2, 0, 5, 1, 3), (5, 4, 3, 2, 1, 0)])
+def test_an_operators_amplitudes_are_one_condition_whichever_came_first(order: tuple[int, ...]) -> None:
+    """Within 3 % of the one in their midst; a ramp of another amplitude, and one that was broken off, are no part."""
+    amplitudes = np.array([0.972, 0.99, 1.0, 1.005, 1.027, 0.93])
+    reference = np.concatenate([a * half_sine(1) for a in amplitudes[list(order)]])
+    closures = group_closures(reference, 1e-3, find_closures(reference, 1e-3), "c")
+    other = order.index(5)
+    assert [k for k, c in enumerate(closures) if c.condition != closures[other - 1].condition] == [other]
+
+    spans = find_closures(reference, 1e-3)
+    start, stop = spans[order.index(1)]
+    spans[order.index(1)] = start, start + 0.5 * (stop - start)
+    left = group_closures(reference, 1e-3, spans, "c")
+    assert len(left) == 5 and len({c.condition for c in left}) == 2, (
+        "one that was broken off is no part, and no kind"
+    )
+
+
 def soft_moves(seconds: float, rest: float, count: int = 5) -> np.ndarray:
     """Minimum-jerk moves to 1 and back, each after a rest, from one of 0.5 s on."""
     u = np.linspace(0.0, 1.0, round(1e3 * seconds))

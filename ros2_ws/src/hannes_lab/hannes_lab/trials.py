@@ -72,6 +72,10 @@ FOLLOWED = 0.25
 MOST_TOLD = 4
 """Gaps that are told one by one."""
 
+USUAL = 0.8
+PART = 0.3
+"""Parts of a closure's usual length: of less it was cut off, and of still less it is not known what it was part of."""
+
 SAME = 5e-4
 """Mean difference of the references of two closures, in their span, up to which one repeats the other: a reference that
 was logged by messages may be seen a control period earlier or later from closure to closure."""
@@ -505,38 +509,61 @@ def _stillest(speed: Array, offset: int, nearly: float) -> tuple[int, int]:
 def group_closures(
     reference: Array, period: float, spans: Iterable[tuple[float, float]], name: str, step: float = 0.0
 ) -> list[Closure]:
-    """Closures whose reference is the same (within 3 % of its span, as far as the shorter one goes) share a condition.
+    """Closures whose reference is the same (within 3 % of its span of one in their midst) share a condition.
+
+    In their midst is the one that most others are like.  What was broken off belongs to a condition that it is like as
+    far as it goes.
 
     step  s between two samples of the logged reference: closures may begin anywhere between two
     Cut-off closures (less than 80 % of the usual length of their condition) are dropped.
     """
-    kinds: list[Array] = []
-    members: list[tuple[float, float, int]] = []
-    for start, stop in spans:
-        shape = reference[
-            np.clip(np.arange(round(start / period), round(stop / period) + 1), 0, reference.size - 1)
-        ]
-        span = float(np.ptp(shape)) or 1.0
-        for index, other in enumerate(kinds):
-            n = min(shape.size, other.size)
-            slope = _change(shape, step / period)
-            alike = (
-                n >= 0.3 * other.size
-                and float(np.max(np.abs(shape[:n] - other[:n]))) <= 0.03 * span + slope + 1e-9
-            )
-            if alike:
-                members.append((start, stop, index))
-                break
-        else:
-            members.append((start, stop, len(kinds)))
-            kinds.append(shape)
+    spans = list(spans)
+    shapes = [
+        reference[np.clip(np.arange(round(start / period), round(stop / period) + 1), 0, reference.size - 1)]
+        for start, stop in spans
+    ]
+    kinds = _kinds(shapes, step / period)
     out = []
-    for index in range(len(kinds)):
-        own = [(a, b) for a, b, i in members if i == index]
+    for index, members in enumerate(kinds):
+        own = [spans[k] for k in members]
         usual = float(np.median([b - a for a, b in own]))
         label = name if len(kinds) == 1 else f"{name}.{index + 1}"
-        out += [Closure(a, min(b, a + usual), label) for a, b in own if b - a >= 0.8 * usual]
+        out += [Closure(a, min(b, a + usual), label) for a, b in own if b - a >= USUAL * usual]
     return sorted(out, key=lambda closure: closure.start)
+
+
+def _kinds(shapes: Sequence[Array], ticks: float) -> list[list[int]]:
+    """Numbers of the references (n,) of closures that are the same, by kind, each kind in order of its first one.
+
+    ticks  between two samples of the logged reference
+    """
+    slopes = [_change(shape, ticks) for shape in shapes]
+    heights = [float(np.ptp(shape)) or 1.0 for shape in shapes]
+    sizes = np.array([shape.size for shape in shapes])
+
+    def alike(k: int, m: int) -> bool:
+        one, other, n = shapes[k], shapes[m], min(sizes[k], sizes[m])
+        most = 0.03 * min(heights[k], heights[m]) + max(slopes[k], slopes[m]) + 1e-9
+        few = slice(0, n, max(1, n // 50))  # most that differ do so there already
+        return all(float(np.max(np.abs(one[some] - other[some]))) <= most for some in (few, slice(0, n)))
+
+    like = np.eye(len(shapes), dtype=bool)
+    for k, m in itertools.combinations(range(len(shapes)), 2):
+        if min(sizes[k], sizes[m]) >= USUAL * max(sizes[k], sizes[m]):
+            like[k, m] = like[m, k] = alike(k, m)
+    left, kinds = np.ones(len(shapes), dtype=bool), []
+    while left.any():
+        middle = int(np.argmax(np.where(left, like[left].sum(axis=0), 0)))
+        kinds.append((middle, np.flatnonzero(left & like[:, middle]).tolist()))
+        left &= ~like[:, middle]
+    out: list[tuple[int, list[int]]] = []
+    for middle, members in sorted(kinds, key=lambda kind: -sizes[kind[0]]):
+        parted = [own for where, own in out if sizes[middle] >= PART * sizes[where] and alike(middle, where)]
+        if parted:
+            parted[0].extend(members)
+        else:
+            out.append((middle, members))
+    return sorted(sorted(members) for _, members in out)
 
 
 def _change(shape: Array, ticks: float) -> float:
