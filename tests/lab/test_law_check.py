@@ -95,6 +95,29 @@ def test_a_gain_in_another_unit_is_said(
     assert said in prepare([trial], model, rig=of_gains(rig, kp, kd)).notes
 
 
+@pytest.mark.parametrize(("kp", "right"), [(800.0, True), (1600.0, False)])
+def test_a_gain_of_each_recording_that_run_gives_is_the_one_that_is_asked(
+    kp: float, right: bool, machine: tuple[type[PlantRig], Model, Trial]
+) -> None:
+    """The model file says another one: `run` gives the law a model that has the recording's."""
+    rig, model, clean = machine
+    trial = replace(noisy(clean), options={"kp": kp})
+
+    class Own(Law):
+        def __init__(self, gain: float, period: float) -> None:
+            super().__init__(None, period)
+            self.parameters = np.array([gain, 60.0])
+
+    def run(self, model, values, trial, reference):  # type: ignore[no-untyped-def]
+        return rig.run(self, replace(model, controller=str(trial.options["kp"])), values, trial, reference)
+
+    def controller(self, model, period):  # type: ignore[no-untyped-def]
+        return Own(float(model.controller) if model.controller[:1].isdigit() else 200.0, period)
+
+    own = type("Own", (rig,), {"run": run, "controller": controller})
+    assert (law_notes(own([trial]), model) == []) is right
+
+
 @pytest.mark.parametrize(("shift", "row"), [(1, "before"), (-1, "after")])
 def test_a_command_that_stands_a_row_off_is_said(
     shift: int, row: str, machine: tuple[type[PlantRig], Model, Trial]

@@ -207,6 +207,7 @@ class PlantRig:
         self._signals: OrderedDict[tuple[Any, ...], dict[str, Array]] = OrderedDict()
         self._came_back = True
         self._model: tuple[Model, tuple[str, ...], dict[str, float]] | None = None
+        self.law_used: Controller | None = None
         self.one_mass = False
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -388,6 +389,7 @@ class PlantRig:
     ) -> Rollout:
         """The rollout from reset, or from where the reference `before` leads."""
         plant, controller, base = self._plant(model, trial)
+        self.law_used = controller
         wanted = self._wanted(model, values, trial)
         reference = moved(reference, wanted.pop(REFERENCE_DELAY, 0.0), 0.0, trial)
         for name in set(base) - set(wanted):
