@@ -21,7 +21,7 @@ from hannes_lab.falls import error_falls
 from hannes_lab.features import compact_end
 from hannes_lab.fit import Fit, finite_differences, fit, prior_weights
 from hannes_lab.forces import Forces, scaling
-from hannes_lab.greedy import _left_open
+from hannes_lab.greedy import _left_open, as_good
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import effect_coordinates
 from hannes_lab.rig import Nuisance, load_rig, scaled_effect, unit_factor
@@ -574,6 +574,16 @@ def test_an_effect_that_the_data_leave_open_must_take_half_of_the_error(
     cut = diagnose(prepared, only, executor=executor)
     assert [effect.name for effect in cut.effects] == ["coulomb_friction"]
     assert any("for the data leave cogging.period open" in note for note in cut.notes)
+
+
+def test_a_further_parameter_must_be_worth_it() -> None:
+    """Presliding friction of no length to speak of is Coulomb friction; it foretold 2 % better, and came first."""
+    near = 1.02
+    assert as_good([1.0, 1.03], [6, 5], near) == [0, 1]
+    assert as_good([1.0, 1.06], [6, 5], near) == [0]
+    assert as_good([1.0, 1.03, 1.01], [6, 6, 6], near) == [0, 2]
+    assert as_good([1.03, 1.0, 1.02], [5, 6, 5], near) == [1, 2], "one that is as simple is there already"
+    assert as_good([float("nan"), float("nan")], [5, 6], near) == []
 
 
 @pytest.fixture

@@ -30,6 +30,9 @@ machine: chance makes it 1, and up to this where five repeats differ by one para
 ALIKE = 0.02
 """Candidates whose held-out error is this close to the best, as a part of it, tie with it."""
 
+SIMPLER = 0.05
+"""The same of one with fewer parameters, which then comes first: a further parameter must be worth more than this."""
+
 ALIKE_WITHIN_CHANCE = 0.06
 """The same of candidates that all leave no more than the machine repeats (AS_IT_REPEATS): what is left is scatter,
 which decides by which of them a condition is foretold a little better.  The better fit comes first then."""
@@ -249,19 +252,17 @@ def _judge(
     left_open = [_left_open(search, candidate, base) for candidate in judged]
     most = [min(LEFT_OPEN, 1.0 - gain) if names else 1.0 - gain for names in left_open]
     scores = [error / math.sqrt(part) for error, part in zip(held, most, strict=True)]
-    least = min(scores)
     within = not units and min(held) <= AS_IT_REPEATS
     near = 1.0 + (ALIKE_WITHIN_CHANCE if within else ALIKE)
-    alike = [k for k in range(len(judged)) if scores[k] <= near * least]
+    sizes = [len(candidate.fit.coordinates) for candidate in judged]
+    alike = as_good(scores, sizes, near)
     if within:
         alike = [k for k in alike if held[k] <= AS_IT_REPEATS] or alike
     if not alike:
         return _Judged(judged[0], float("nan"), (), 1.0 - gain)
     for candidate in judged:
         search.keep(candidate)
-    winner = min(
-        alike, key=lambda k: (len(judged[k].fit.coordinates), judged[k].penalised if within else scores[k])
-    )
+    winner = min(alike, key=lambda k: (sizes[k], judged[k].penalised if within else scores[k]))
     joins = [error <= math.sqrt(part) * before for error, part in zip(held, most, strict=True)]
     others = [
         k
@@ -272,6 +273,21 @@ def _judge(
     rivals = tuple(judged[k] for k in sorted(others, key=lambda k: held[k]))
     error = search.once(held_out_error, judged[winner], False, units, text=f"{text}: held-out conditions")
     return _Judged(judged[winner], error, rivals, most[winner], left_open[winner])
+
+
+def as_good(scores: Sequence[float], sizes: Sequence[int], near: float) -> list[int]:
+    """Which candidates are as good as the best: within a factor `near` of its score, and of those with fewer
+    parameters than all of these also the ones within SIMPLER."""
+    least = min(scores)
+    fewest = min(
+        (size for size, score in zip(sizes, scores, strict=True) if score <= near * least), default=0
+    )
+    far = max(near, 1.0 + SIMPLER)
+    return [
+        k
+        for k, (size, score) in enumerate(zip(sizes, scores, strict=True))
+        if score <= (far if size < fewest else near) * least
+    ]
 
 
 def _left_open(search: Search, candidate: Candidate, base: Candidate) -> str:
