@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hannes_description.model import Model
-from hannes_lab.errors import SignalError, held_out_condition_errors, overall
+from hannes_lab.errors import SignalError, held_out_condition_errors, held_out_conditions, overall
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.search import Candidate, Search
@@ -33,8 +33,14 @@ def test_an_effect_that_only_the_left_out_condition_shows_does_not_foretell_it()
     without = search.null()
     damped = search.add(without, "object_damping")
     assert damped.fit.cost < 0.5 * without.fit.cost, "fitted to both, it explains the grasp"
-    grasp = [overall(left_out(search, candidate)["grasp_fast"]) for candidate in (without, damped)]
-    assert grasp[1] == pytest.approx(grasp[0], rel=0.05), "left out, it cannot be foretold"
+    found = [
+        held_out_conditions(search.problem, c.fit.model, c.fit.coordinates, c.fit.z)["grasp_fast"]
+        for c in (without, damped)
+    ]
+    # What is left of the grasp chatters on the undamped bar, and ends a tenth apart from start to start.
+    grasp = [overall(errors) for errors, _ in found]
+    assert grasp[1] > 0.5 * grasp[0] > 10.0, "left out, it cannot be foretold"
+    assert abs(found[1][1]["object_damping.coefficient"]) < 1e-6
 
 
 def test_what_another_condition_of_the_recording_tells_is_not_fitted_to_the_left_out_one() -> None:
