@@ -546,6 +546,10 @@ def test_without_repeats_what_only_fits_better_is_not_shown() -> None:
     assert "as fitted (on conditions that were left out) than as given (0.79 of the error)" in note
     unknown = replace(given, held_out_signals={}), replace(fitted, held_out_signals={})
     assert not worse_fitted(unknown)
+    assert "pulls the parameters elsewhere" not in note
+    apart = Fall("", 8.0, 8.0, {}, (), {}, 16.6), Fall("", 8.0, 8.5, {}, (), {}, 52.1)
+    (note,) = worse_fitted(apart)
+    assert "foretold 3.1 times worse by it" in note and "the gains, the supply or the load" in note
 
 
 def test_an_interval_that_the_end_of_the_range_cuts_is_said(gloved: Search) -> None:
@@ -589,6 +593,10 @@ def test_an_error_that_rises_is_said_to_rise() -> None:
         "The error on conditions that were left out of the fit falls from 4.00 (nominal, fitted) to"
     )
     assert said.endswith("(on held-out closures from 4.00 to 2.00).")
+    between = fall("gravity", 3.5, {"slow": 1.0, "fast": 6.0})
+    for by_conditions in (False, True):
+        said = fall_sentence([given, steps[1], between], by_conditions=by_conditions)
+        assert "rises from 3.00 (nominal, as given; 4.00 as fitted) to 3.50 times" in said
     said = fall_sentence([*steps, worse])
     assert "rises from 4.00 (nominal, fitted) to 4.50 times" in said
     assert "'slow' from 3.00 to 1.00, 'fast' from 5.00 to 6.00" in said

@@ -184,10 +184,8 @@ def fall_sentence(falls: Sequence[Fall], by_conditions: bool = False) -> str:
         given = f" ({nominal:.2f} as it was given)" if nominal < after else ""
         return f"The error on held-out closures is {after:.2f} times the repeatability{given}."
     verb = "falls" if after <= nominal else "rises"
-    said = (
-        f"The error on held-out closures {verb} from {nominal:.2f} ({first.added}) to {after:.2f} times the "
-        "repeatability"
-    )
+    begin = _begin(first, nominal, falls[NOMINAL_FITTED].held_out, after)
+    said = f"The error on held-out closures {verb} from {begin} to {after:.2f} times the repeatability"
     if after <= nominal:
         return f"{said}."
     old, new = first.by_condition, falls[-1].by_condition
@@ -209,9 +207,14 @@ def _by_conditions(falls: Sequence[Fall]) -> str:
         else ""
     )
     verb = "falls" if after <= nominal else "rises"
-    return (
-        f"{what} {verb} from {nominal:.2f} ({first.added}) to {after:.2f} times the repeatability{closures}."
-    )
+    begin = _begin(first, nominal, falls[NOMINAL_FITTED].held_out_conditions, after)
+    return f"{what} {verb} from {begin} to {after:.2f} times the repeatability{closures}."
+
+
+def _begin(first: Fall, error: float, fitted: float, after: float) -> str:
+    """Whence an error falls or rises; where it rises from the model as given, with that of its fit, which is farther
+    off still: the effects were added to that."""
+    return f"{error:.2f} ({first.added}{f'; {fitted:.2f} as fitted' if error < after < fitted else ''})"
 
 
 def errors_in_units(falls: Sequence[Mapping[str, Any]]) -> tuple[bool, list[dict[str, float]]]:

@@ -22,6 +22,10 @@ SINGULAR = 1e-12
 """Least eigenvalue of the curvature, scaled to a diagonal of one, that is told from rounding."""
 
 
+NOTHING = 1e-6
+"""Change of the whitened residual for a tolerance of a parameter below which that moves nothing."""
+
+
 @dataclass(frozen=True)
 class Fit:
     """A fitted point.
@@ -66,6 +70,14 @@ class Fit:
         """Nuisance parameters with how many standard deviations of their priors they are off, farthest first."""
         off = [(c, abs(float(z))) for c, z in zip(self.coordinates, self.z, strict=True) if c.nuisance]
         return sorted(off, key=lambda item: -item[1])
+
+    @property
+    def unmoved(self) -> list[str]:
+        """Nuisance parameters that move the data by nothing: what is fitted of them is where the fit began."""
+        sizes = np.linalg.norm(self.jacobian, axis=0)
+        return [
+            c.name for c, size in zip(self.coordinates, sizes, strict=True) if c.nuisance and size < NOTHING
+        ]
 
     @property
     def at_end(self) -> list[Coordinate]:
@@ -470,10 +482,10 @@ def nuisance_table(
     found: Fit, intervals: Mapping[str, tuple[float, float]] | None = None
 ) -> dict[str, dict[str, Any]]:
     """The nuisance parameters of a fit by name: value and nominal in their unit, and the difference in standard
-    deviations of the prior (`prior_sds`); with intervals their ends, else NaN."""
+    deviations of the prior (`prior_sds`); with intervals their ends, else NaN.  Not those that move nothing."""
     out: dict[str, dict[str, Any]] = {}
     for c, z in zip(found.coordinates, found.z, strict=True):
-        if c.nuisance:
+        if c.nuisance and c.name not in found.unmoved:
             low, high = (intervals or {}).get(c.name, (math.nan, math.nan))
             value, nominal = c.value(float(z)), c.value(0.0)
             out[c.name] = {"value": value, "nominal": nominal, "prior_sds": float(z)}

@@ -19,6 +19,7 @@ from .problem import Coordinate, Problem, nuisance_coordinate
 from .report_text import UNKNOWN, listed
 from .rig import Nuisance
 from .search import FAR, PENALTY, Candidate, Search, key_of
+from .trials import Trial, curves_of
 
 ANY_DIFFERENCE = (
     "a difference of any size counts here that chance does not explain; no simple model of a real machine is that "
@@ -51,6 +52,9 @@ HELD = 0.01
 
 SHOWN_WAVES = 2.0
 """Waves within the way below which it is worth a note that a ripple has not been seen to repeat."""
+
+ONE_WAY = 0.8
+"""Part of its way that a machine is away at the end of a condition from where it began, if that goes one way."""
 
 NAMED = 4
 """Effects that a sentence names; of more, it says how many."""
@@ -185,6 +189,10 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
     )
 
 
+PULLED_APART = 2.0
+"""How many times worse a fit may foretell conditions that were left out than the model as given before it is said."""
+
+
 def worse_fitted(falls: Sequence[Fall]) -> tuple[str, ...]:
     """A sentence where the fit of the nominal model has a larger error than the nominal model itself."""
     given, fitted = left_out_errors(falls)[:WITHOUT_EFFECT]
@@ -193,9 +201,17 @@ def worse_fitted(falls: Sequence[Fall]) -> tuple[str, ...]:
     said = f"{fitted:.2f}) than as given ({given:.2f} times the repeatability"
     if not np.isfinite(falls[NOMINAL_FITTED].held_out):
         said = f"on conditions that were left out) than as given ({given:.2f} of the error"
+    before, after = (fall.held_out_conditions for fall in falls[:WITHOUT_EFFECT])
+    pulled = (
+        f". Conditions that were left out are foretold {after / before:.1f} times worse by it: each pulls the "
+        "parameters elsewhere, as where the gains, the supply or the load of a recording are not those that the model "
+        "has for it"
+        if after > PULLED_APART * before > 0.0
+        else ""
+    )
     return (
         f"the nominal model is further off as fitted ({said}): a fit weighs each sample by how well it is known and "
-        "how far a model of this form may be off, and pays for tolerances; these errors do not",
+        f"how far a model of this form may be off, and pays for tolerances; these errors do not{pulled}",
     )
 
 
@@ -233,13 +249,45 @@ def notes(
         *((clock.said,) if clock else ()),
         *_inseparable(search, experiments),
         *_ends(search, best, effects),
+        *(_one_way(search.problem.features.trials) if greedy and verdict != "nothing" else ()),
         *_few_waves(search, best),
         *_coasting(search, best),
+        *_unmoved(best),
         *_undescribed(best),
         *_taken_for_its_own(search, best),
         *_identifiability(best),
         *failure_notes(search.problem),
     )
+
+
+def _unmoved(best: Candidate) -> list[str]:
+    """What has a tolerance and moves nothing."""
+    names = [name for name in best.fit.unmoved if "@" not in name]
+    have = "has a tolerance, but moves" if len(names) == 1 else "have tolerances, but move"
+    return [f"{', '.join(names[:NAMED])}: {have} none of the compared signals in these recordings"] * bool(
+        names
+    )
+
+
+def _one_way(trials: Sequence[Trial]) -> list[str]:
+    """Of conditions that each go one way: which one is alone in its direction, which no other one foretells."""
+    ways: dict[str, float] = {}
+    for trial in trials:
+        own = np.arange(trial.reference.size, dtype=np.float64) * trial.period, trial.reference
+        time, place = trial.signals.get("encoder_position", own)
+        for condition in trial.conditions:
+            curve = np.median(curves_of(trial.of(condition), time, place), axis=0)
+            gone, net = float(np.abs(np.diff(curve)).sum()), float(curve[-1] - curve[0])
+            ways[condition] = float(np.sign(net)) if abs(net) > ONE_WAY * gone else 0.0
+    if 0.0 in ways.values() or len(set(ways.values())) < 2:
+        return []
+    alone = [name for name, way in ways.items() if list(ways.values()).count(way) == 1]
+    return [
+        f"'{name}' is the only condition that goes its way: what acts in one direction is not foretold from the other "
+        "one, so that no effect of the direction can be named; record another amplitude or speed each way, or make one "
+        "condition of both"
+        for name in alone[:1]
+    ]
 
 
 def _few_waves(search: Search, best: Candidate) -> list[str]:
