@@ -5,6 +5,7 @@ import json
 import pickle
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from hannes_lab.falls import error_falls
 from hannes_lab.features import compact_end
 from hannes_lab.fit import Fit, finite_differences, fit, prior_weights
 from hannes_lab.forces import Forces, scaling
-from hannes_lab.greedy import _left_open, as_good
+from hannes_lab.greedy import _judge, _left_open, _polish_in_worker, as_good
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import effect_coordinates
 from hannes_lab.rig import Nuisance, load_rig, scaled_effect, unit_factor
@@ -584,6 +585,33 @@ def test_a_further_parameter_must_be_worth_it() -> None:
     assert as_good([1.0, 1.03, 1.01], [6, 6, 6], near) == [0, 2]
     assert as_good([1.03, 1.0, 1.02], [5, 6, 5], near) == [1, 2], "one that is as simple is there already"
     assert as_good([float("nan"), float("nan")], [5, 6], near) == []
+
+
+@pytest.mark.parametrize(("simpler", "winner"), [(9.4, 0), (9.15, 1), (9.6, 0)])
+def test_a_simpler_effect_that_does_not_join_ends_no_search(
+    simpler: float, winner: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An effect must lower the error of 10 to 9.22; the one with a parameter more lowers it to 9."""
+    held = [9.0, simpler]
+    candidates: Any = [
+        SimpleNamespace(names=(f"effect {k}",), penalised=0.0, fit=SimpleNamespace(coordinates=range(6 - k)))
+        for k in range(2)
+    ]
+
+    def each(function: Any, items: Any, text: str) -> list[Any]:
+        polish = function is _polish_in_worker
+        return [item[0] if polish else held[candidates.index(item[0])] for item in items]
+
+    search: Any = SimpleNamespace(
+        each=each,
+        keep=lambda candidate: candidate,
+        once=lambda function, *item, text: each(function, [item], text)[0],
+    )
+    monkeypatch.setattr("hannes_lab.greedy.distorted", lambda *args: False)
+    monkeypatch.setattr("hannes_lab.greedy._left_open", lambda *args: "")
+    found = _judge(search, candidates, "", candidates[0], 0.15, 10.0, (("position", 1.0),))
+    assert found.best is candidates[winner] and found.falls(10.0)
+    assert found.rivals == ((candidates[0],) if winner else ())
 
 
 @pytest.fixture

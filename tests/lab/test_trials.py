@@ -1,5 +1,6 @@
 """From recordings to trials: reference on the grid, closures, conditions, outliers."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -413,6 +414,29 @@ def test_an_operators_amplitudes_are_one_condition_whichever_came_first(order: t
     assert len(left) == 5 and len({c.condition for c in left}) == 2, (
         "one that was broken off is no part, and no kind"
     )
+
+
+def test_where_an_operators_amplitudes_part_does_not_depend_on_their_order() -> None:
+    """Two are in the midst of as many: the one that these are more like counts."""
+    amplitudes = np.array([1.0, 1.02, 1.04, 1.061])
+    found = set()
+    for order in itertools.permutations(range(4)):
+        reference = np.concatenate([a * half_sine(1) for a in amplitudes[list(order)]])
+        closures = group_closures(reference, 1e-3, find_closures(reference, 1e-3), "c")
+        kinds = {c.condition: [] for c in closures}
+        for k, closure in enumerate(closures):
+            kinds[closure.condition].append(order[k])
+        found.add(frozenset(frozenset(own) for own in kinds.values()))
+    assert found == {frozenset({frozenset({0, 1, 2}), frozenset({3})})}
+
+
+def test_of_many_closures_a_few_are_asked() -> None:
+    """As the middle of a condition: a hundred of two kinds are told apart, each with its scatter."""
+    rng = np.random.default_rng(3)
+    amplitudes = np.where(np.arange(100) % 3 == 0, 0.8, 1.0) * (1.0 + 0.008 * rng.standard_normal(100))
+    reference = np.concatenate([a * half_sine(1) for a in amplitudes])
+    closures = group_closures(reference, 1e-3, find_closures(reference, 1e-3), "c")
+    assert [c.condition for c in closures] == ["c.1" if k % 3 == 0 else "c.2" for k in range(100)]
 
 
 def soft_moves(seconds: float, rest: float, count: int = 5) -> np.ndarray:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 from hannes_description.model import Model
+from hannes_lab.diagnosis import Fall
 from hannes_lab.fit import Fit, nuisance_table
 from hannes_lab.problem import nuisance_coordinate
 from hannes_lab.rig import Nuisance
 from hannes_lab.search import Candidate
 from hannes_lab.trials import Closure, Trial
-from hannes_lab.wording import _one_way, _unmoved
+from hannes_lab.wording import _one_way, notes, unmoved, worse_fitted
 
 
 def test_a_condition_that_is_alone_in_its_direction_is_told() -> None:
@@ -43,6 +48,66 @@ def test_a_tolerance_of_what_moves_nothing_is_no_result() -> None:
     jacobian = np.array([[1.0, 0.0], [2.0, 1e-9]])
     found = Fit(model, coordinates, np.array([0.5, 1e-12]), 1.0, np.zeros(2), jacobian)
     assert list(nuisance_table(found)) == ["friction.coulomb"]
-    assert _unmoved(Candidate((), found, 1.0)) == [
-        "log.reference_delay: has a tolerance, but moves none of the compared signals in these recordings"
+    (said,) = unmoved(found)
+    assert said.startswith("log.reference_delay: has a tolerance, but moves none of the compared signals")
+    five = [replace(coordinates[1], name=f"{name}@a") for name in "vwxyz"]
+    more = replace(found, coordinates=tuple(five), z=np.zeros(5), jacobian=np.zeros((2, 5)))
+    assert unmoved(more)[0].startswith("v, w, x, y and 1 more: have tolerances, but move none")
+
+
+@pytest.mark.parametrize(
+    ("closures", "conditions", "said"),
+    [
+        ((8.0, 8.5), (16.6, 52.1), ["further off as fitted (8.50)", "3.1 times worse"]),
+        ((8.0, 7.9), (2.0, 40.0), ["20.0 times worse"]),
+        ((8.0, 8.5), (16.6, 20.0), ["further off as fitted (8.50)"]),
+        ((8.0, 7.9), (16.6, math.inf), []),
+        ((8.0, 7.9), (math.nan, math.nan), []),
+    ],
+)
+def test_a_fit_that_foretells_far_worse_than_the_model_as_given_is_told(
+    closures: tuple[float, float], conditions: tuple[float, float], said: list[str]
+) -> None:
+    falls = [
+        Fall("", own, own, {}, (), {}, left_out) for own, left_out in zip(closures, conditions, strict=True)
     ]
+    found = worse_fitted(falls)
+    assert len(found) == len(said) and all(words in note for words, note in zip(said, found, strict=True))
+    assert not said or "20.0" not in said[-1] or "the gains, the supply or the load" in found[-1]
+
+
+def test_the_same_where_nothing_was_repeated() -> None:
+    """There errors count in what the fitted nominal model leaves."""
+    nan = math.nan
+    falls = [Fall("", nan, nan, {}, (), {"position": error}) for error in (0.1, 1.0)]
+    assert "10.0 times worse" in worse_fitted(falls)[-1]
+
+
+def test_an_answer_has_these_notes() -> None:
+    """On a machine where conditions that are left out decide."""
+    ticks = np.arange(2000) * 1e-3
+    place = np.where(ticks < 1.0, ticks, 2.0 - ticks)
+    closures = (Closure(0.005, 0.995, "up"), Closure(1.005, 1.995, "down"))
+    trial = Trial("t", 1e-3, place, {"encoder_position": (ticks, place)}, closures)
+    model, idle = (
+        Model.load(),
+        nuisance_coordinate(Nuisance("log.reference_delay", 0.0, 0.01, False, 0.0, "s")),
+    )
+    best = Candidate((), Fit(model, (idle,), np.zeros(1), 0.0, np.zeros(2), np.zeros((2, 1))), 0.0)
+    problem = SimpleNamespace(
+        features=SimpleNamespace(trials=(trial,), blocks=(), conditions=("up", "down"), repeated=False),
+        rig=SimpleNamespace(foreign=True),
+        failures=0,
+        simulations=1,
+        discrepancy=(),
+    )
+    search: Any = SimpleNamespace(problem=problem, model=model, nuisances=(), sources={})
+
+    def told(verdict: str, greedy: bool) -> list[bool]:
+        said = notes(search, best, verdict, (), (), greedy, None)
+        return [
+            any(words in note for note in said) for words in ("goes its way", "moves none of the compared")
+        ]
+
+    assert told("unknown", True) == [True, True]
+    assert told("unknown", False) == told("nothing", True) == [False, True]

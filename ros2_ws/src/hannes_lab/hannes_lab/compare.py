@@ -23,7 +23,7 @@ from .fit import nuisance_table
 from .phases import METRICS, PHASES, metrics, phase_of
 from .prepare import FEW, Prepared
 from .search import Progress, Search, silent
-from .wording import held_notes, moved_notes, other_clock, untold
+from .wording import held_notes, moved_notes, other_clock, unmoved, untold
 
 Array = NDArray[np.float64]
 
@@ -198,7 +198,7 @@ def compare(
             found = search.null().fit
             table = nuisance_table(found)
             features, values, clock = prepared.features, found.values, other_clock(prepared.problem, found)
-            own = [*([clock.said] if clock else []), *moved_notes(found), *held_notes(found)]
+            own = [*([clock.said] if clock else []), *moved_notes(found), *held_notes(found), *unmoved(found)]
     predicted = features.closures(prepared.rig, model, values)
     contact = _contact(prepared, values)
     labels = [_labels(features, block, contact) for block in features.blocks]

@@ -73,7 +73,7 @@ class Fit:
 
     @property
     def unmoved(self) -> list[str]:
-        """Nuisance parameters that move the data by nothing: what is fitted of them is where the fit began."""
+        """Nuisance parameters that move the data by nothing: their tolerance holds them at the nominal value."""
         sizes = np.linalg.norm(self.jacobian, axis=0)
         return [
             c.name for c, size in zip(self.coordinates, sizes, strict=True) if c.nuisance and size < NOTHING
@@ -484,8 +484,9 @@ def nuisance_table(
     """The nuisance parameters of a fit by name: value and nominal in their unit, and the difference in standard
     deviations of the prior (`prior_sds`); with intervals their ends, else NaN.  Not those that move nothing."""
     out: dict[str, dict[str, Any]] = {}
+    unmoved = found.unmoved
     for c, z in zip(found.coordinates, found.z, strict=True):
-        if c.nuisance and c.name not in found.unmoved:
+        if c.nuisance and c.name not in unmoved:
             low, high = (intervals or {}).get(c.name, (math.nan, math.nan))
             value, nominal = c.value(float(z)), c.value(0.0)
             out[c.name] = {"value": value, "nominal": nominal, "prior_sds": float(z)}

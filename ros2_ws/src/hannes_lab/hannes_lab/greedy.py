@@ -258,12 +258,15 @@ def _judge(
     alike = as_good(scores, sizes, near)
     if within:
         alike = [k for k in alike if held[k] <= AS_IT_REPEATS] or alike
+    joins = [error <= math.sqrt(part) * before for error, part in zip(held, most, strict=True)]
+    alike = [
+        k for k in alike if joins[k]
+    ] or alike  # a simpler one that does not join is no end of the search
     if not alike:
         return _Judged(judged[0], float("nan"), (), 1.0 - gain)
     for candidate in judged:
         search.keep(candidate)
     winner = min(alike, key=lambda k: (sizes[k], judged[k].penalised if within else scores[k]))
-    joins = [error <= math.sqrt(part) * before for error, part in zip(held, most, strict=True)]
     others = [
         k
         for k in range(len(judged))
@@ -314,7 +317,7 @@ def _left_open(search: Search, candidate: Candidate, base: Candidate) -> str:
 
 def _close_call(best: Candidate, rivals: Sequence[Candidate]) -> str:
     names = " or ".join(" + ".join(n for n in c.names if n not in best.names) for c in rivals)
-    return f"when {best.names[-1]} joined, {names} would have been as good within {100 * ALIKE:.0f} %"
+    return f"when {best.names[-1]} joined, {names} would have foretold about as well"
 
 
 def _polish_in_worker(search: Search, candidate: Candidate) -> Candidate:

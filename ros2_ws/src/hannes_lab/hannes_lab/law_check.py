@@ -82,12 +82,12 @@ def _off(rig: PlantRig, model: Model, trial: Trial) -> _Off | None:
     """How far the law's answers are off in a trial; None where it cannot be asked."""
     rig.law_used = None
     named = _named(rig, model, trial)
-    # A rig's own `run` may give each recording gains of its own.
-    law = rig.law_used or rig.controller(model, trial.period)
     command, position = named.get("motor_voltage"), named.get("encoder_position")
     stretches = _stretches(trial)
     if command is None or position is None or command == position or not stretches:
         return None
+    # A rig's own `run` may give each recording gains of its own.
+    law = rig.law_used if rig.law_used is not None else rig.controller(model, trial.period)
     current = named.get("motor_current")
     answers = [_answers(law, trial, own, position, current) for own in stretches]
     if current is None:

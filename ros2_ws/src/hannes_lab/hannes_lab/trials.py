@@ -11,7 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -73,8 +73,13 @@ MOST_TOLD = 4
 """Gaps that are told one by one."""
 
 USUAL = 0.8
+"""Part of its condition's usual length that a closure has at least; of less it was cut off."""
+
 PART = 0.3
-"""Parts of a closure's usual length: of less it was cut off, and of still less it is not known what it was part of."""
+"""The same of less than which it is not known what it was part of: it is a condition of its own."""
+
+MIDDLES = 30
+"""Closures of which one is looked for that most others are like; of more, some at even distances."""
 
 SAME = 5e-4
 """Mean difference of the references of two closures, in their span, up to which one repeats the other: a reference that
@@ -509,10 +514,10 @@ def _stillest(speed: Array, offset: int, nearly: float) -> tuple[int, int]:
 def group_closures(
     reference: Array, period: float, spans: Iterable[tuple[float, float]], name: str, step: float = 0.0
 ) -> list[Closure]:
-    """Closures whose reference is the same (within 3 % of its span of one in their midst) share a condition.
+    """Closures of which the reference is within 3 % (of the smaller one's span) of the one that most of them are like
+    share a condition.
 
-    In their midst is the one that most others are like.  What was broken off belongs to a condition that it is like as
-    far as it goes.
+    What was broken off belongs to a condition that it is like as far as it goes.
 
     step  s between two samples of the logged reference: closures may begin anywhere between two
     Cut-off closures (less than 80 % of the usual length of their condition) are dropped.
@@ -541,24 +546,47 @@ def _kinds(shapes: Sequence[Array], ticks: float) -> list[list[int]]:
     heights = [float(np.ptp(shape)) or 1.0 for shape in shapes]
     sizes = np.array([shape.size for shape in shapes])
 
-    def alike(k: int, m: int) -> bool:
+    def apart(k: int, m: int) -> float:
+        """Largest difference as far as both go, in what it may be; infinite beyond."""
         one, other, n = shapes[k], shapes[m], min(sizes[k], sizes[m])
         most = 0.03 * min(heights[k], heights[m]) + max(slopes[k], slopes[m]) + 1e-9
-        few = slice(0, n, max(1, n // 50))  # most that differ do so there already
-        return all(float(np.max(np.abs(one[some] - other[some]))) <= most for some in (few, slice(0, n)))
+        for some in (
+            slice(0, n, max(1, n // 50)),
+            slice(0, n),
+        ):  # most that differ do so in a few samples already
+            largest = float(np.max(np.abs(one[some] - other[some])))
+            if not largest <= most:
+                return math.inf
+        return largest / most
 
-    like = np.eye(len(shapes), dtype=bool)
-    for k, m in itertools.combinations(range(len(shapes)), 2):
-        if min(sizes[k], sizes[m]) >= USUAL * max(sizes[k], sizes[m]):
-            like[k, m] = like[m, k] = alike(k, m)
-    left, kinds = np.ones(len(shapes), dtype=bool), []
-    while left.any():
-        middle = int(np.argmax(np.where(left, like[left].sum(axis=0), 0)))
-        kinds.append((middle, np.flatnonzero(left & like[:, middle]).tolist()))
-        left &= ~like[:, middle]
+    @cache
+    def away(k: int) -> Array:
+        """How far all are from one, of those that last about as long."""
+        near = np.minimum(sizes, sizes[k]) >= USUAL * np.maximum(sizes, sizes[k])
+        return np.array([apart(k, m) if near[m] else math.inf for m in range(len(shapes))])
+
+    def alone(k: int) -> tuple[int, float]:
+        """Orders closures by how many of those that are left are like them, and how much."""
+        own = away(k)[left]
+        like = own < math.inf
+        return -int(like.sum()), float(own[like].sum())
+
+    left = np.arange(len(shapes))
+    kinds = []
+    while left.size:
+        some = left[np.unique(np.linspace(0, left.size - 1, min(left.size, MIDDLES)).astype(int))]
+        middle = int(min(some, key=alone))
+        own = away(middle)[left] < math.inf
+        own |= left == middle
+        kinds.append((middle, left[own].tolist()))
+        left = left[~own]
     out: list[tuple[int, list[int]]] = []
     for middle, members in sorted(kinds, key=lambda kind: -sizes[kind[0]]):
-        parted = [own for where, own in out if sizes[middle] >= PART * sizes[where] and alike(middle, where)]
+        parted = [
+            own
+            for where, own in out
+            if sizes[middle] >= PART * sizes[where] and apart(middle, where) < math.inf
+        ]
         if parted:
             parted[0].extend(members)
         else:

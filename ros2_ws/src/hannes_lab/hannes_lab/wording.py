@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from .choose import Choice, can_be_held_out, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
-from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, fall_sentence, left_out_errors
+from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, deciding_errors, fall_sentence, left_out_errors
 from .fit import Fit, fit
 from .problem import Coordinate, Problem, nuisance_coordinate
 from .report_text import UNKNOWN, listed
@@ -54,7 +55,7 @@ SHOWN_WAVES = 2.0
 """Waves within the way below which it is worth a note that a ripple has not been seen to repeat."""
 
 ONE_WAY = 0.8
-"""Part of its way that a machine is away at the end of a condition from where it began, if that goes one way."""
+"""Part of its range that a machine is away at the end of a condition from where it began, if that goes one way."""
 
 NAMED = 4
 """Effects that a sentence names; of more, it says how many."""
@@ -194,25 +195,25 @@ PULLED_APART = 2.0
 
 
 def worse_fitted(falls: Sequence[Fall]) -> tuple[str, ...]:
-    """A sentence where the fit of the nominal model has a larger error than the nominal model itself."""
+    """Sentences where the fit of the nominal model has a larger error than the nominal model itself."""
     given, fitted = left_out_errors(falls)[:WITHOUT_EFFECT]
-    if not fitted > given:
-        return ()
-    said = f"{fitted:.2f}) than as given ({given:.2f} times the repeatability"
-    if not np.isfinite(falls[NOMINAL_FITTED].held_out):
-        said = f"on conditions that were left out) than as given ({given:.2f} of the error"
-    before, after = (fall.held_out_conditions for fall in falls[:WITHOUT_EFFECT])
-    pulled = (
-        f". Conditions that were left out are foretold {after / before:.1f} times worse by it: each pulls the "
-        "parameters elsewhere, as where the gains, the supply or the load of a recording are not those that the model "
-        "has for it"
-        if after > PULLED_APART * before > 0.0
-        else ""
-    )
-    return (
-        f"the nominal model is further off as fitted ({said}): a fit weighs each sample by how well it is known and "
-        f"how far a model of this form may be off, and pays for tolerances; these errors do not{pulled}",
-    )
+    out = []
+    if fitted > given:
+        said = f"{fitted:.2f}) than as given ({given:.2f} times the repeatability"
+        if not np.isfinite(falls[NOMINAL_FITTED].held_out):
+            said = f"on conditions that were left out) than as given ({given:.2f} of the error"
+        out.append(
+            f"the nominal model is further off as fitted ({said}): a fit weighs each sample by how well it is known "
+            "and how far a model of this form may be off, and pays for tolerances; these errors do not"
+        )
+    given, fitted = deciding_errors(falls)[:WITHOUT_EFFECT]
+    if math.inf > fitted > PULLED_APART * given > 0.0:
+        out.append(
+            f"the fitted nominal model foretells conditions that were left out {fitted / given:.1f} times worse than "
+            "the one as given: each pulls the parameters elsewhere. Perhaps the gains, the supply or the load of a "
+            "recording are not those that the model has for it"
+        )
+    return tuple(out)
 
 
 APART, THAN_OTHERS = 2.5, 2.0
@@ -252,7 +253,7 @@ def notes(
         *(_one_way(search.problem.features.trials) if greedy and verdict != "nothing" else ()),
         *_few_waves(search, best),
         *_coasting(search, best),
-        *_unmoved(best),
+        *unmoved(best.fit),
         *_undescribed(best),
         *_taken_for_its_own(search, best),
         *_identifiability(best),
@@ -260,13 +261,19 @@ def notes(
     )
 
 
-def _unmoved(best: Candidate) -> list[str]:
+def unmoved(found: Fit) -> list[str]:
     """What has a tolerance and moves nothing."""
-    names = [name for name in best.fit.unmoved if "@" not in name]
+    names = list(dict.fromkeys(name.partition("@")[0] for name in found.unmoved))
     have = "has a tolerance, but moves" if len(names) == 1 else "have tolerances, but move"
-    return [f"{', '.join(names[:NAMED])}: {have} none of the compared signals in these recordings"] * bool(
-        names
-    )
+    return [
+        f"{_some(names)}: {have} none of the compared signals in these recordings, and is no result"
+    ] * bool(names)
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first NAMED of some names, and how many more there are."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return f"{', '.join(names[:NAMED])}{more}"
 
 
 def _one_way(trials: Sequence[Trial]) -> list[str]:
@@ -277,14 +284,14 @@ def _one_way(trials: Sequence[Trial]) -> list[str]:
         time, place = trial.signals.get("encoder_position", own)
         for condition in trial.conditions:
             curve = np.median(curves_of(trial.of(condition), time, place), axis=0)
-            gone, net = float(np.abs(np.diff(curve)).sum()), float(curve[-1] - curve[0])
-            ways[condition] = float(np.sign(net)) if abs(net) > ONE_WAY * gone else 0.0
+            net = float(curve[-1] - curve[0])
+            ways[condition] = float(np.sign(net)) if abs(net) > ONE_WAY * float(np.ptp(curve)) else 0.0
     if 0.0 in ways.values() or len(set(ways.values())) < 2:
         return []
     alone = [name for name, way in ways.items() if list(ways.values()).count(way) == 1]
     return [
-        f"'{name}' is the only condition that goes its way: what acts in one direction is not foretold from the other "
-        "one, so that no effect of the direction can be named; record another amplitude or speed each way, or make one "
+        f"'{name}' is the only condition that goes its way: what acts in that direction alone is not foretold from the "
+        "others, so that an effect of it cannot be confirmed; record another amplitude or speed each way, or make one "
         "condition of both"
         for name in alone[:1]
     ]
@@ -614,9 +621,8 @@ def untold(nuisances: Sequence[Nuisance]) -> list[str]:
     """What the recordings do not say of the machine, and of each of them, where nothing was fitted."""
     wide = sorted((n.name for n in nuisances if nuisance_coordinate(n).wide), key=lambda name: "@" in name)
     names = list(dict.fromkeys(name.partition("@")[0] for name in wide))
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return [
-        f"the recordings do not tell {', '.join(names[:NAMED])}{more}: here they are the model's, --fitted fits them"
+        f"the recordings do not tell {_some(names)}: here they are the model's, --fitted fits them"
     ] * bool(names)
 
 
