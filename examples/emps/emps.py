@@ -96,4 +96,4 @@ class Emps(PlantRig):
         signals = {"drive_force": (grid, float(gtau[0]) * voltage), "encoder_position": (grid, position)}
         return Trial("emps", period, reference, signals, tuple(closures), {"gtau": float(gtau[0])}, str(path),
                      hashlib.sha256(path.read_bytes()).hexdigest(),
-                     units={"drive_force": "N", "encoder_position": "m"})  # fmt: skip
+                     units={"drive_force": "N", "encoder_position": "m", "reference": "m"})  # fmt: skip

@@ -11,6 +11,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.adapter import check_trials
 from hannes_lab.blocks import in_blocks, told_apart
+from hannes_lab.cli_trials import told
 from hannes_lab.compare import compare
 from hannes_lab.hand import make_controller
 from hannes_lab.phases import PHASES, phase_of
@@ -414,6 +415,12 @@ def test_an_operators_amplitudes_are_one_condition_whichever_came_first(order: t
     assert len(left) == 5 and len({c.condition for c in left}) == 2, (
         "one that was broken off is no part, and no kind"
     )
+
+
+@pytest.mark.parametrize(("units", "unit"), [({}, "rad"), ({"reference": "V"}, "V")])
+def test_the_unit_of_the_reference_is_what_the_trial_says(units: dict[str, str], unit: str) -> None:
+    trial = replace(make_trial(recording(half_sine(3), 250.0)), units=units)
+    assert next(s["unit"] for s in told(trial, "rad")["signals"] if s["name"] == "reference") == unit
 
 
 def test_where_an_operators_amplitudes_part_does_not_depend_on_their_order() -> None:

@@ -46,7 +46,7 @@ def trials(
 def told(trial: Trial, unit: str = "") -> dict[str, Any]:
     """A trial in numbers: times in s, a rate in Hz (the median of its samples), ranges in the signal's unit.
 
-    unit  of the reference
+    unit  of the reference, where the trial does not say it (`units`)
     """
     conditions = []
     for name in trial.conditions:
@@ -61,7 +61,7 @@ def told(trial: Trial, unit: str = "") -> dict[str, Any]:
                 "starts": [c.start for c in own],
             }
         )
-    signals = [_signal("reference", unit, trial.reference, trial.period)]
+    signals = [_signal("reference", trial.units.get("reference", unit), trial.reference, trial.period)]
     for name, (time, values) in trial.signals.items():
         step = float(np.median(np.diff(time))) if time.size > 1 else float("nan")
         signals.append(_signal(name, trial.unit(name), values, step))

@@ -145,7 +145,7 @@ class Trial:
     reference  (n,) on the control grid: reference[k] acts from k x period on
     signals    name -> (time (m,) s, values (m,))
     options    what the plant must know of this recording (object, sensors, plant); the rig's adapter reads it
-    units      units of signals whose unit is not that of UNITS
+    units      units of signals whose unit is not that of UNITS; of another machine's reference by "reference"
     parts      the recordings that it is joined of; empty if it is one
     fresh      each part, or the recording beside others that it is joined to, begins as the first does, whatever came
                before; else one goes on where another ended
