@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from typing import Annotated
 
 import typer
+from hannes_description.errors import HannesError
+from hannes_description.model import Model
 
 from hannes_bringup.environment import require_ros, ros_environment
 from hannes_bringup.ros2_standin import (
@@ -76,6 +79,7 @@ def graph(
     if record:
         given |= {"record": "true", "bag": os.path.abspath(record)}
     given |= parse_launch_arguments(arguments or [])
+    _check_files(given)
     if has_real_ros2(environment):
         words = [f"{name}:={value}" for name, value in given.items()]
         os.execvpe("ros2", ["ros2", "launch", "hannes_bringup", LAUNCH_FILE, *words], environment)
@@ -84,6 +88,15 @@ def graph(
     path = launch_path("hannes_bringup", LAUNCH_FILE, environment)
     plan = read_launch_file(path, given, lambda package: share_folder(package, environment))
     raise typer.Exit(launch(plan, environment))
+
+
+def _check_files(given: Mapping[str, str]) -> None:
+    """Refuse a model or an EMG recording that is not there before anything is started, and not by a node after it."""
+    Model.load(given["model"])
+    if given["emg"] and not os.path.isfile(given["emg"]):
+        raise HannesError(
+            f"No EMG recording '{given['emg']}': give the path of a .csv file, or none for synthetic EMG."
+        )
 
 
 def _absolute(name_or_path: str) -> str:
