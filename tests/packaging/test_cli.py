@@ -147,7 +147,7 @@ def test_interrupt_is_130() -> None:
         "sys.exit(cli.main())"
     )
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (answer.returncode, answer.stderr) == (130, "")
+    assert (answer.returncode, answer.stderr) == (130, "\nhannes: interrupted\n")
 
 
 def test_without_ros_the_ros_commands_say_what_to_do() -> None:

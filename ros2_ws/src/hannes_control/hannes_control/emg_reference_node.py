@@ -103,6 +103,7 @@ class EmgReferenceNode(HannesNode, Node):
         self._held = [0.0, 0.0]
         self._heard: dict[str, float] = {}
         self._arrivals = tuple(Arrivals() for _ in _CHANNELS)
+        self._rate_off = False
         self._waiting = [_LONGEST_QUEUE, _LONGEST_QUEUE]
         self._taken = 0
         self._stamp = -1
@@ -226,12 +227,16 @@ class EmgReferenceNode(HannesNode, Node):
             self._answer()
 
     def _rates(self, both: bool) -> str:
-        """Rates of both channels; in real time, where `both` come, one that is not the parameter's is a fault."""
+        """Rates of both channels; in real time, where `both` come, one that is not the parameter's is a fault.
+
+        At two looks in a row: what waited while the machine was busy comes faster once.
+        """
         rates = [arrivals.rate() for arrivals in self._arrivals]
         known, wanted = [rate for rate in rates if rate is not None], self._p.rate
-        if self._lockstep or not both or all(abs(r - wanted) <= _RATE_OFF * wanted for r in known):
+        before, self._rate_off = self._rate_off, any(abs(r - wanted) > _RATE_OFF * wanted for r in known)
+        if self._lockstep or not both or not self._rate_off:
             self._health.faults.good("rate")
-        else:
+        elif before:
             # A pair is taken when both are there: the slower channel tells how often.
             self._health.faults.bad(
                 "rate",

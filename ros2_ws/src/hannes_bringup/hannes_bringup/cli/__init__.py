@@ -146,14 +146,15 @@ def main() -> int:
         print(f"hannes: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        return _stopped(came)
+        return _stopped(came, said=False)
     except SystemExit as end:
         # typer and rich say this where a pipe broke; whether one did stands in the context
         if isinstance(end.__context__, BrokenPipeError):
             return _nobody_reads()
         code = end.code
-        if code == _INTERRUPTED:  # typer's, whatever stopped it
-            return _stopped(came)
+        if code == _INTERRUPTED:  # typer's, whatever stopped it; a command that caught it has said so
+            by_typer = isinstance(getattr(end.__context__, "__cause__", None), KeyboardInterrupt)
+            return _stopped(came, said=not by_typer)
     except BrokenPipeError:
         return _nobody_reads()
     except OSError:
@@ -169,11 +170,14 @@ def main() -> int:
     raise SystemExit(code)
 
 
-def _stopped(terminated: threading.Event) -> int:
-    if not terminated.is_set():
-        return _INTERRUPTED
-    print("\nhannes: terminated", file=sys.stderr)
-    return _TERMINATED
+def _stopped(terminated: threading.Event, *, said: bool) -> int:
+    """The exit code of a command that was stopped, and its one line unless the command has said it."""
+    if terminated.is_set():
+        print("\nhannes: terminated", file=sys.stderr)
+        return _TERMINATED
+    if not said:
+        print("\nhannes: interrupted", file=sys.stderr)
+    return _INTERRUPTED
 
 
 def _open_what_is_closed() -> None:
