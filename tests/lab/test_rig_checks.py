@@ -3,13 +3,16 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from hannes_description.model import Model
-from hannes_lab.adapter import _unlike
+from hannes_lab.adapter import _coarse, _unlike, count_of
 from hannes_lab.own_law import check_own_law
 from hannes_lab.rig import load_rig
+from hannes_lab.trials import Closure, Trial
 from hannes_sim.factory import make_plant
 from hannes_sim.plant import DEFAULT_DT
 from hannes_sim.rollout import rollout, step_of
@@ -491,3 +494,24 @@ def test_an_encoder_of_the_other_sign_is_said_of_a_step_and_of_volts() -> None:
     assert _unlike("encoder_position", "rad", reference, (t, motion), (t, 1.1 * motion)) is None
     volts = (t, np.full(t.size, -6.0))
     assert _unlike("encoder_position", "rad", volts, (t, -motion), (t, motion)) is not None
+
+
+def test_an_encoder_that_is_coarser_than_the_floor_is_told() -> None:
+    """Whole degrees of an arm that swings by 2 rad, logged at 200 Hz; noise over many counts hides no step."""
+    t = np.arange(2000) * 5e-3
+    angle = np.where(t < 4.0, 0.0, 1.0 - np.cos(t - 4.0))
+    counts = np.radians(np.round(np.degrees(angle)))
+    noise = 0.1 * np.random.default_rng(0).standard_normal(t.size)
+
+    def told(values: np.ndarray, floor: float = 2e-4) -> list[str]:
+        trial = Trial("arm", 5e-3, angle, {"encoder_position": (t, values)}, (Closure(0.0, 9.0, "swing"),))
+        rig: Any = SimpleNamespace(trials=(trial,), floor=floor)
+        return _coarse(rig)
+
+    (said,) = told(counts)
+    assert "in steps of 0.0175 rad in 'arm'" in said and "make it 0.003" in said
+    assert count_of(np.round(counts, 4)) == pytest.approx(np.radians(1.0), rel=0.01), "a log of few digits"
+    switched = np.where(t < 5.0, 0.0, 12.0)
+    for values in (angle, np.radians(np.round(np.degrees(angle + noise))), switched):
+        assert count_of(values) == 0.0 and not told(values)
+    assert not told(counts, floor=3e-3)

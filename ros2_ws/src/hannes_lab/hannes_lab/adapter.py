@@ -78,7 +78,46 @@ def check_rig(rig: Rig) -> list[str]:
         notes.append(
             f"{who} gives no `sizes`: the effects of the catalogue have bounds and typical values of a drive of {usual}"
         )
-    return notes
+    return notes + _coarse(rig)
+
+
+def _coarse(rig: PlantRig) -> list[str]:
+    """Where the encoder is read in steps that are no noise and larger than `floor` takes for noise: at its worst."""
+    worst, of = 0.0, ""
+    for trial in rig.trials:
+        values = trial.signals.get(ENCODER, (np.zeros(0), np.zeros(0)))[1]
+        step = count_of(values)
+        part = step / math.sqrt(12.0) / float(np.ptp(values)) if step > 0.0 else 0.0
+        if part > worst:
+            worst, of = part, f"in steps of {step:.3g} {trial.unit(ENCODER)} in '{trial.name}'"
+    return [
+        f"{ENCODER} is read {of}: rounding alone is {worst:.2g} of its span, and the class's `floor` takes "
+        f"{rig.floor:g} for noise: make it {worst:.1g}"
+    ] * (worst > CLEARLY * rig.floor)
+
+
+CLEARLY = 1.25
+"""Times `floor` from which what rounding makes is worth a note."""
+
+STANDS_STILL = 0.3
+"""Part of the samples that are the one before again from which steps of a signal are no noise."""
+
+LEVELS = 10
+"""Different values of a signal at least: of fewer it may be a command that is switched."""
+
+WHOLE = 0.05
+"""Part of a step by which multiples of it may be off: logs have few digits."""
+
+
+def count_of(values: Array) -> float:
+    """The step in which a signal (n,) is logged; 0 where none is seen, or where noise goes over many steps."""
+    levels = np.unique(values)
+    gaps = np.diff(levels)
+    if levels.size < LEVELS or np.mean(np.diff(values) == 0.0) < STANDS_STILL:
+        return 0.0
+    step = float(np.median(gaps[gaps < 1.5 * float(np.quantile(gaps, 0.1))]))
+    off = np.abs(gaps / step - np.rint(gaps / step))
+    return step if bool(np.all(off <= WHOLE)) else 0.0
 
 
 def _check_grid(rig: PlantRig, who: str) -> None:
