@@ -9,13 +9,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from hannes_description.model import Model
 from hannes_lab.cli_files import check_writable
 from hannes_lab.cli_show import _show_conditions, relative_error
 from hannes_lab.compare import MetricRow
 from hannes_lab.diagnosis import Fall
 from hannes_lab.wording import condition_apart, failure_notes
-from hannes_sim.effect import load_effect
+from hannes_sim.effect import load_effect, strength_of
 from lab.foreign_bags import hannes, hannes_in_one_line, signals_of_set, write_bag, write_set
 
 
@@ -188,6 +189,31 @@ def test_hide_keeps_the_truth_away_from_the_bags(
     assert code == 2 and "exists already" in err
 
 
+def test_values_of_a_hidden_effect_may_be_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A strength and a shape; what is not given is as the factor makes it."""
+    truth = tmp_path / "truth.yaml"
+    words = ("hide", str(tmp_path / "set"), "--truth", str(truth), "--closures", "1", "--condition", "fast")
+    own = ("--effect", "cogging=2", "--value", "cogging.period=2.9", "--value", "cogging.cosine=-0.004")
+    code, _, err = hannes(
+        *words, *own, "--effect", "viscous_friction", capsys=capsys, monkeypatch=monkeypatch
+    )
+    assert code == 0, err
+    cogging, viscous = yaml.safe_load(truth.read_text())["effects"]
+    values = {name: p["value"] for name, p in cogging["parameters"].items()}
+    assert (values["period"], values["cosine"]) == (2.9, -0.004)
+    twice = strength_of("cogging", 2.0).values
+    assert {n: v for n, v in values.items() if n not in ("period", "cosine")} == pytest.approx(
+        {n: v for n, v in twice.items() if n not in ("period", "cosine")}
+    )
+    assert cogging["parameters"]["period"]["source"] == "given to hannes hide"
+    assert (
+        viscous["parameters"]["coefficient"]["value"]
+        == strength_of("viscous_friction", 1.0).values["coefficient"]
+    )
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -344,6 +370,21 @@ def test_a_full_output_is_one_line_and_a_reader_that_has_gone_none(
         (("--effect", "cogging=inf"), "but not 0"),
         (("--effect", "cogging", "--effect", "cogging=3"), "cogging is given more than once"),
         (("--condition", "fast", "--condition", "fast"), "fast is asked for more than once"),
+        (("--effect", "cogging", "--value", "cogging.period"), "give EFFECT.PARAMETER=NUMBER"),
+        (("--effect", "cogging", "--value", "cogging.period=long"), "give EFFECT.PARAMETER=NUMBER"),
+        (("--effect", "cogging", "--value", "cogging.period=nan"), "give EFFECT.PARAMETER=NUMBER"),
+        (
+            ("--effect", "cogging", "--value", "gravity.sine=0.1"),
+            "'gravity' is not hidden (--effect); hidden are: cogging",
+        ),
+        (("--value", "gravity.sine=0.1"), "hidden are: none"),
+        (("--effect", "cogging", "--value", "cogging.wave=1"), "has no parameter wave; valid are sine"),
+        (("--effect", "cogging", "--value", "cogging.period=99999"), "period = 99999.0 rad is outside"),
+        (("--effect", "wire_slack", "--value", "wire_slack.slack=0"), "'wire_slack' hides nothing"),
+        (
+            ("--effect", "cogging", *("--value", "cogging.period=2", "--value", "cogging.period=3")),
+            "cogging.period is given more than once",
+        ),
         (("--seed", "-3"), "greater than or equal to 0"),
     ],
 )

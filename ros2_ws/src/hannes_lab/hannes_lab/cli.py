@@ -178,6 +178,14 @@ def hide(
             "out to hide nothing.",
         ),
     ] = None,
+    values: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--value",
+            help="EFFECT.PARAMETER=NUMBER in SI, once for each: a strength or a shape of a hidden effect, such as "
+            "cogging.period=2.9.",
+        ),
+    ] = None,
     model: Annotated[
         str, typer.Option("--model", help="Model file, or the name of a shipped model.")
     ] = "nominal",
@@ -197,10 +205,8 @@ def hide(
     json: Json = False,
 ) -> None:
     """Make a measurement set with a hidden effect, to test the lab or to learn what an effect looks like."""
-    from hannes_sim.effect import strength_of
-
     from .hand import HandRig
-    from .hide import DEFAULT_CONDITIONS, empty_trial, make_set, write_set
+    from .hide import DEFAULT_CONDITIONS, empty_trial, entries_of, make_set, write_set
     from .own_effect import along_reference, check_own_effects
     from .own_law import check_own_code
 
@@ -219,18 +225,17 @@ def hide(
 
     for given in wanted.items():
         _check_factor(*given)
+    entries = entries_of(wanted, values or ())
     hand, trial = Model.load(model), empty_trial("fast")
     check_own_code(HandRig([trial]), hand)
 
     def simulate(source: str) -> None:
-        entry = strength_of(source, wanted[source])
-        make_set(hand, [entry], seed=seed, closures=1, conditions=["fast"], scatter=0.0)
+        make_set(hand, [entries[source]], seed=seed, closures=1, conditions=["fast"], scatter=0.0)
 
     check_own_effects(wanted, simulate, along_reference(trial, trial.reference))
-    entries = [strength_of(name, factor) for name, factor in wanted.items()]
     recordings, hidden = make_set(
         hand,
-        entries,
+        list(entries.values()),
         seed=seed,
         closures=closures,
         sensors=sensors,

@@ -21,6 +21,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import EffectEntry, Model
 from hannes_description.parameters import data_path, read_yaml
 from hannes_description.signals import SIGNALS
+from hannes_sim.effect import load_effect, strength_of
 from hannes_sim.factory import make_plant
 from hannes_sim.measurement import SENSORS, Sensors
 from hannes_sim.objects import named_object
@@ -218,3 +219,42 @@ def write_set(
             f"The truth cannot be written to '{truth_file}': {error.strerror or error}."
         ) from error
     return bags
+
+
+def entries_of(wanted: Mapping[str, float], texts: Sequence[str]) -> dict[str, EffectEntry]:
+    """Entries of effects (name or path.py:Class -> factor of the typical strength) by these words.
+
+    texts   "EFFECT.PARAMETER=NUMBER": values of their own, in SI; the others stay as the factor makes them
+    Raises HannesError for a text that is not of that form, an effect that is not hidden, a parameter that it has not, a
+    value out of its range, and where nothing would be hidden.
+    """
+    kinds = {source: load_effect(source) for source in wanted}
+    own: dict[str, dict[str, float]] = {kind.name: {} for kind in kinds.values()}
+    for text in texts:
+        place, _, number = text.rpartition("=")
+        name, _, parameter = place.partition(".")
+        try:
+            value = float(number)
+        except ValueError:
+            value = math.nan
+        if not (name and parameter and math.isfinite(value)):
+            raise HannesError(f"--value {text}: give EFFECT.PARAMETER=NUMBER, such as cogging.period=2.9.")
+        if name not in own:
+            hidden = ", ".join(own) or "none"
+            raise HannesError(
+                f"--value {text}: the effect '{name}' is not hidden (--effect); hidden are: {hidden}."
+            )
+        if parameter in own[name]:
+            raise HannesError(f"--value {name}.{parameter} is given more than once; give one number.")
+        own[name][parameter] = value
+    out = {}
+    for source, factor in wanted.items():
+        kind, entry = kinds[source], strength_of(source, factor)
+        if given := own[kind.name]:
+            values = {**entry.values, **given}
+            entry = kind.entry(values, source=entry.source, where="given to hannes hide")
+            strengths = [p for p in kind.parameters if p.vanishing is not None]
+            if all(entry.values[p.name] == p.vanishing for p in strengths):
+                raise HannesError(f"--value: with {', '.join(given)} as given, '{kind.name}' hides nothing.")
+        out[source] = entry
+    return out
