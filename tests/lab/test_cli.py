@@ -10,11 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from hannes_description.model import Model
+from hannes_description.model import EffectEntry, Model
 from hannes_lab.cli_files import check_writable
 from hannes_lab.cli_show import _show_conditions, relative_error
 from hannes_lab.compare import MetricRow
 from hannes_lab.diagnosis import Fall
+from hannes_lab.hide import make_set, visibility
 from hannes_lab.wording import condition_apart, failure_notes
 from hannes_sim.effect import load_effect, strength_of
 from lab.foreign_bags import hannes, hannes_in_one_line, signals_of_set, write_bag, write_set
@@ -189,12 +190,27 @@ def test_hide_keeps_the_truth_away_from_the_bags(
     assert code == 2 and "exists already" in err
 
 
+def test_how_much_an_effect_changes_is_counted_in_the_closures_scatter() -> None:
+    model, how = Model.load(), {"seed": 4, "closures": 4, "conditions": ("fast",)}
+
+    def seen(*effects: EffectEntry, closures: int = 4) -> dict[str, dict[str, float]]:
+        asked = {**how, "closures": closures}
+        return visibility(make_set(model, effects, **asked)[0], make_set(model, [], **asked)[0])
+
+    assert seen() == {"fast": {"encoder_position": 0.0, "motor_current": 0.0}}
+    once, twice = (seen(strength_of("viscous_friction", factor))["fast"] for factor in (1.0, 2.0))
+    assert (
+        all(1.5 * once[name] < twice[name] < 2.5 * once[name] for name in once) and min(once.values()) > 0.5
+    )
+    assert seen(strength_of("viscous_friction", 1.0), closures=1) == {}, "one closure has no scatter"
+
+
 def test_values_of_a_hidden_effect_may_be_given(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A strength and a shape; what is not given is as the factor makes it."""
     truth = tmp_path / "truth.yaml"
-    words = ("hide", str(tmp_path / "set"), "--truth", str(truth), "--closures", "1", "--condition", "fast")
+    words = ("hide", str(tmp_path / "set"), "--truth", str(truth), "--closures", "3", "--condition", "fast")
     own = ("--effect", "cogging=2", "--value", "cogging.period=2.9", "--value", "cogging.cosine=-0.004")
     code, _, err = hannes(
         *words, *own, "--effect", "viscous_friction", capsys=capsys, monkeypatch=monkeypatch

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from hannes_description.errors import HannesError
@@ -206,7 +207,7 @@ def hide(
 ) -> None:
     """Make a measurement set with a hidden effect, to test the lab or to learn what an effect looks like."""
     from .hand import HandRig
-    from .hide import DEFAULT_CONDITIONS, empty_trial, entries_of, make_set, write_set
+    from .hide import DEFAULT_CONDITIONS, empty_trial, entries_of, make_set, visibility, write_set
     from .own_effect import along_reference, check_own_effects
     from .own_law import check_own_code
 
@@ -233,19 +234,29 @@ def hide(
         make_set(hand, [entries[source]], seed=seed, closures=1, conditions=["fast"], scatter=0.0)
 
     check_own_effects(wanted, simulate, along_reference(trial, trial.reference))
-    recordings, hidden = make_set(
-        hand,
-        list(entries.values()),
-        seed=seed,
-        closures=closures,
-        sensors=sensors,
-        conditions=conditions or DEFAULT_CONDITIONS,
-    )
+    how: dict[str, Any] = {"seed": seed, "closures": closures, "sensors": sensors}
+    how["conditions"] = conditions or DEFAULT_CONDITIONS
+    recordings, hidden = make_set(hand, list(entries.values()), **how)
+    if entries:
+        hidden = replace(hidden, visible=visibility(recordings, make_set(hand, [], **how)[0]))
     bags = write_set(recordings, hidden, out, truth)
     if json:
         print_json({"bags": [str(b) for b in bags], "truth": str(truth)})
         return
     typer.echo(f"{len(bags)} bags in {out}, the truth in {truth}")
+    if hidden.visible:
+        signals = dict.fromkeys(name for own in hidden.visible.values() for name in own)
+        seen = {name: [own[name] for own in hidden.visible.values() if name in own] for name in signals}
+        told = ", ".join(f"{name} {' .. '.join(_ends(ratios))}" for name, ratios in seen.items())
+        typer.echo(
+            f"What is hidden moves the mean closure by {told} times the closures' scatter (over the conditions), "
+            "before the hand's own parameters take over what they can."
+        )
+
+
+def _ends(ratios: Sequence[float]) -> list[str]:
+    """Least and greatest of some numbers, once if they read the same."""
+    return list(dict.fromkeys(f"{ratio:.2g}" for ratio in (min(ratios), max(ratios))))
 
 
 def _check_factor(source: str, factor: float) -> None:

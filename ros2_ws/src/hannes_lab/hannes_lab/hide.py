@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from .described import CONTROL_PERIOD
 from .hand import make_controller
-from .trials import Closure, Trial
+from .trials import Closure, Trial, curves_of, make_trial
 
 Array = NDArray[np.float64]
 
@@ -87,13 +87,17 @@ class Truth:
     """the hand's own beside the nominal: 'x 1.0421' or '+ 0.0031 rad'"""
     seed: int
     plant: str
+    visible: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """condition -> signal -> what the effects change, in multiples of the closures' scatter; see `visibility`"""
 
     def to_dict(self) -> dict[str, Any]:
+        seen = {name: {s: float(f"{v:.3g}") for s, v in own.items()} for name, own in self.visible.items()}
         return {
             "seed": self.seed,
             "plant": self.plant,
             "effects": [e.to_dict() for e in self.effects],
             "parameters": dict(self.parameters),
+            **({"visible": seen} if seen else {}),
         }
 
 
@@ -192,6 +196,27 @@ def _record(
         "plant": model.plant,
     }
     return Recording(channels, metadata, spec.name)
+
+
+def visibility(recordings: Sequence[Recording], without: Sequence[Recording]) -> dict[str, dict[str, float]]:
+    """How much recordings differ from those of the same hand, scatter and noise without the effects.
+
+    Condition -> signal -> root mean square of the difference of the mean closures over that of the closures' own
+    scatter: what a fit of the hand's own parameters leaves of it is less, and of an effect that is much like one of
+    them next to nothing.  Signals that repeat exactly are left out, and all where a condition has one closure.
+    """
+    out = {}
+    for recording, bare in zip(recordings, without, strict=True):
+        trial, plain = make_trial(recording), make_trial(bare)
+        own = {}
+        for name, (time, values) in plain.signals.items():
+            closures = curves_of(plain.closures, time, values)
+            apart = curves_of(plain.closures, *trial.signals[name]).mean(axis=0) - closures.mean(axis=0)
+            scatter = np.std(closures, axis=0, ddof=1) if len(closures) > 1 else np.zeros(1)
+            if scatter.any():
+                own[name] = float(np.sqrt(np.mean(apart**2) / np.mean(scatter**2)))
+        out[str(recording.metadata["condition"])] = own
+    return {name: own for name, own in out.items() if own}
 
 
 def write_set(
