@@ -22,7 +22,7 @@ from hannes_lab.falls import error_falls
 from hannes_lab.features import compact_end
 from hannes_lab.fit import Fit, finite_differences, fit, prior_weights
 from hannes_lab.forces import Forces, scaling
-from hannes_lab.greedy import _judge, _left_open, _polish_in_worker, as_good
+from hannes_lab.greedy import _judge, _left_open, _polish_in_worker, as_good, to_judge
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import effect_coordinates
 from hannes_lab.rig import Nuisance, load_rig, scaled_effect, unit_factor
@@ -577,6 +577,14 @@ def test_an_effect_that_the_data_leave_open_must_take_half_of_the_error(
     assert any("for the data leave cogging.period open" in note for note in cut.notes)
 
 
+def test_what_fits_as_well_as_one_that_is_judged_is_judged_too() -> None:
+    costs = [100.0, 110.0, 120.0, 120.1, 120.4, 130.0]
+    candidates: Any = [SimpleNamespace(penalised=cost) for cost in costs]
+    assert [c.penalised for c in to_judge(candidates)] == [100.0, 110.0, 120.0, 120.1]
+    same: Any = [SimpleNamespace(penalised=100.0) for _ in range(9)]
+    assert len(to_judge(same)) == 6 and to_judge(candidates[:2]) == candidates[:2]
+
+
 def test_a_further_parameter_must_be_worth_it() -> None:
     """Presliding friction of no length to speak of is Coulomb friction; it foretold 2 % better, and came first."""
     near = 1.02
@@ -606,12 +614,20 @@ def test_a_simpler_effect_that_does_not_join_ends_no_search(
         each=each,
         keep=lambda candidate: candidate,
         once=lambda function, *item, text: each(function, [item], text)[0],
+        effect=lambda name: SimpleNamespace(parameters=range(2 - int(name[-1]))),
     )
     monkeypatch.setattr("hannes_lab.greedy.distorted", lambda *args: False)
     monkeypatch.setattr("hannes_lab.greedy._left_open", lambda *args: "")
     found = _judge(search, candidates, "", candidates[0], 0.15, 10.0, (("position", 1.0),))
     assert found.best is candidates[winner] and found.falls(10.0)
     assert found.rivals == ((candidates[0],) if winner else ())
+
+    held[:] = 9.0, 9.1
+    for candidate in candidates:
+        candidate.fit.coordinates = range(5)
+    found = _judge(search, candidates, "", candidates[0], 0.15, 10.0, (("position", 1.0),))
+    assert found.best is candidates[1], "of twins the one that has no parameter which is idle here"
+    assert found.rivals == (candidates[0],)
 
 
 @pytest.fixture

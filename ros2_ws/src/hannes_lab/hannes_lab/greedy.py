@@ -19,6 +19,10 @@ from .search import Candidate, Search
 JUDGED = 3
 """Candidates of each round (the best fits) whose error on held-out conditions is found."""
 
+TWIN = 0.002
+"""Part of its cost by which a further candidate may differ from one of these, and be judged too: where the two are the
+same thing on a machine (a friction by a load that is constant, and Coulomb friction), chance says which comes first."""
+
 POLISH_STEPS = 40
 """Limit on the steps of the last fit of each of them: valleys of friction laws are long."""
 
@@ -247,7 +251,7 @@ def _judge(
     Each error counts in multiples of what it may be at most (LEFT_OPEN, or 1 - gain, of the mean square without it).
     """
     sound = [c for c in candidates if not distorted(search, c)] or candidates
-    judged = search.each(_polish_in_worker, [(c,) for c in sound[:JUDGED]], f"{text}: polish")
+    judged = search.each(_polish_in_worker, [(c,) for c in to_judge(sound)], f"{text}: polish")
     held = search.each(held_out_error, [(c, True, units) for c in judged], f"{text}: held-out conditions")
     left_open = [_left_open(search, candidate, base) for candidate in judged]
     most = [min(LEFT_OPEN, 1.0 - gain) if names else 1.0 - gain for names in left_open]
@@ -266,7 +270,9 @@ def _judge(
         return _Judged(judged[0], float("nan"), (), 1.0 - gain)
     for candidate in judged:
         search.keep(candidate)
-    winner = min(alike, key=lambda k: (sizes[k], judged[k].penalised if within else scores[k]))
+    # Of as many fitted parameters, what has fewer where nothing of it is idle: Coulomb friction before one by the load.
+    whole = [sum(len(search.effect(name).parameters) for name in c.names) for c in judged]
+    winner = min(alike, key=lambda k: (sizes[k], whole[k], judged[k].penalised if within else scores[k]))
     others = [
         k
         for k in range(len(judged))
@@ -276,6 +282,17 @@ def _judge(
     rivals = tuple(judged[k] for k in sorted(others, key=lambda k: held[k]))
     error = search.once(held_out_error, judged[winner], False, units, text=f"{text}: held-out conditions")
     return _Judged(judged[winner], error, rivals, most[winner], left_open[winner])
+
+
+def to_judge(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """The best fits of a round, best first, and their twins."""
+    first = list(candidates[:JUDGED])
+    twins = [
+        c
+        for c in candidates[JUDGED:]
+        if any(abs(c.penalised - one.penalised) <= TWIN * one.penalised for one in first)
+    ]
+    return [*first, *twins[:JUDGED]]
 
 
 def as_good(scores: Sequence[float], sizes: Sequence[int], near: float) -> list[int]:
