@@ -186,6 +186,13 @@ def test_what_swings_at_one_frequency_whatever_the_speed_is_told_from_a_ripple_a
     assert all(d.share < 0.2 for d in _oscillation("motor_current", noise, steps))
     assert _oscillation("motor_current", [c[:, :10] for c in swinging], steps) == []
     assert _oscillation("motor_current", swinging[:1], steps[:1]) == [], "one speed cannot tell"
+    alike = [swinging[0], swinging[0]]
+    assert _oscillation("motor_current", alike, steps[:1] * 2) == [], (
+        "nor do closures of one length, whatever they do"
+    )
+    (told,) = _oscillation("motor_current", alike, steps[:1] * 2, speeds=(1.0, 2.0))
+    assert told.at == pytest.approx(swung.at, rel=0.1), "where their speeds are known, other speeds do"
+    assert _oscillation("motor_current", swinging, steps, speeds=(1.0,) * len(steps)) == []
 
 
 def test_what_a_fit_took_where_is_said() -> None:

@@ -38,7 +38,8 @@ CYCLES = 2.0
 """Least number of cycles in the shortest closure: what is slower is no oscillation, but its form."""
 
 OTHER_SPEED = 1.25
-"""Times that the longest closure lasts at least as long as the shortest, so that they go at different speeds."""
+"""Times that one condition goes faster than another at least; where no position is logged, that a closure lasts
+longer."""
 
 FINE = 4
 """Points of a spectrum for each that the closure's length tells apart."""
@@ -165,7 +166,9 @@ def residual_dependences(
     }
     found = [
         *_dependences(residuals, known, signal, steps, units),
-        *_oscillation(signal, residuals[signal], steps),
+        *_oscillation(
+            signal, residuals[signal], steps, [float(np.abs(v).mean()) for v in known.get("velocity", ())]
+        ),
     ]
     return tuple(sorted(found, key=lambda d: -d.telling))
 
@@ -264,17 +267,20 @@ def _spectrum(closures: Array, step: float) -> _Spectrum | None:
     return _Spectrum(frequency, power / power.sum(), float(mean.var()))
 
 
-def _oscillation(signal: str, residuals: Sequence[Array], steps: Sequence[float]) -> list[Dependence]:
+def _oscillation(
+    signal: str, residuals: Sequence[Array], steps: Sequence[float], speeds: Sequence[float] = ()
+) -> list[Dependence]:
     """What of a residual oscillates at one frequency whatever the condition: what swings does so at its own.
 
-    residuals  per condition block (n, p); steps  s between two phases of each
+    residuals  per condition block (n, p); steps  s between two phases of each; speeds  of each, where they are known
     The share is the least of all conditions that show more than scatter.  A ripple along the way has another frequency
-    at each speed: conditions of one length cannot tell.
+    at each speed: conditions of one speed cannot tell.
     """
     found = [(_spectrum(r, step), r.shape[1] * step) for r, step in zip(residuals, steps, strict=True)]
     spectra = [s for s, _ in found if s is not None]
     lengths = [length for s, length in found if s is not None]
-    if not spectra or max(lengths) < OTHER_SPEED * min(lengths):
+    paces = [pace for (s, _), pace in zip(found, speeds, strict=False) if s is not None] or lengths
+    if not spectra or max(paces) < OTHER_SPEED * min(paces):
         return []
     lowest = BAND * CYCLES / min(lengths)
     highest = min(float(s.frequency[-1]) for s in spectra) / BAND
