@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from hannes_lab.rig import PlantRig, load_rig
 from hannes_lab.trials import Closure, Trial, find_moves
 from hannes_sim.factory import make_plant
 from hannes_sim.native import CONTROL_SIGNATURE
-from hannes_sim.rollout import rollout
+from hannes_sim.rollout import Rollout, rollout
 from lab.single_mass_rig import Law, reference, write_files
 from numba import cfunc
 
@@ -108,10 +109,12 @@ def test_a_gain_of_each_recording_that_run_gives_is_the_one_that_is_asked(
             super().__init__(None, period)
             self.parameters = np.array([gain, 60.0])
 
-    def run(self, model, values, trial, reference):  # type: ignore[no-untyped-def]
+    def run(
+        self: PlantRig, model: Model, values: Mapping[str, float], trial: Trial, reference: np.ndarray
+    ) -> Rollout:
         return rig.run(self, replace(model, controller=str(trial.options["kp"])), values, trial, reference)
 
-    def controller(self, model, period):  # type: ignore[no-untyped-def]
+    def controller(self: PlantRig, model: Model, period: float) -> Law:
         return Own(float(model.controller) if model.controller[:1].isdigit() else 200.0, period)
 
     own = type("Own", (rig,), {"run": run, "controller": controller})

@@ -48,6 +48,11 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     return number(value, digits) if unit in ("", "1") else f"{number(value, digits)} {unit}"
 
 
+def between(low: float, high: float, digits: int = 4) -> str:
+    """A range, or one number where its ends read the same."""
+    return " .. ".join(dict.fromkeys((number(low, digits), number(high, digits))))
+
+
 def estimate(value: float, low: float | None, high: float | None, unit: str) -> tuple[str, str]:
     """A value with its unit, and its interval, with two digits of the interval's half width and four at least."""
     digits = 4

@@ -49,6 +49,18 @@ FEWEST = 2
 OTHER_MOVE = 0.3
 """Mean difference of the references of two closures, in what they go over, from which one does not repeat the other."""
 
+CLEARLY = 1.25
+"""Times `floor` from which what rounding makes is worth a note."""
+
+STANDS_STILL = 0.3
+"""Part of the samples that are the one before again from which steps of a signal are no noise."""
+
+LEVELS = 10
+"""Different values of a signal at least: of fewer it may be a command that is switched."""
+
+WHOLE = 0.05
+"""Part of a step by which multiples of it may be off: logs have few digits."""
+
 
 def check_rig(rig: Rig) -> list[str]:
     """Refuse what an adapter's class says wrongly, and give what it leaves out, in sentences."""
@@ -83,30 +95,19 @@ def check_rig(rig: Rig) -> list[str]:
 
 def _coarse(rig: PlantRig) -> list[str]:
     """Where the encoder is read in steps that are no noise and larger than `floor` takes for noise: at its worst."""
-    worst, of = 0.0, ""
-    for trial in rig.trials:
-        values = trial.signals.get(ENCODER, (np.zeros(0), np.zeros(0)))[1]
-        step = count_of(values)
-        part = step / math.sqrt(12.0) / float(np.ptp(values)) if step > 0.0 else 0.0
-        if part > worst:
-            worst, of = part, f"in steps of {step:.3g} {trial.unit(ENCODER)} in '{trial.name}'"
+    read = [(trial, count_of(trial.signals[ENCODER][1])) for trial in rig.trials if ENCODER in trial.signals]
+    parts = [
+        (step / math.sqrt(12.0) / float(np.ptp(trial.signals[ENCODER][1])), step, trial)
+        for trial, step in read
+        if step > 0.0
+    ]
+    part, step, trial = max(parts, key=lambda one: one[0], default=(0.0, 0.0, None))
+    if trial is None or part <= CLEARLY * rig.floor:
+        return []
     return [
-        f"{ENCODER} is read {of}: rounding alone is {worst:.2g} of its span, and the class's `floor` takes "
-        f"{rig.floor:g} for noise: make it {worst:.1g}"
-    ] * (worst > CLEARLY * rig.floor)
-
-
-CLEARLY = 1.25
-"""Times `floor` from which what rounding makes is worth a note."""
-
-STANDS_STILL = 0.3
-"""Part of the samples that are the one before again from which steps of a signal are no noise."""
-
-LEVELS = 10
-"""Different values of a signal at least: of fewer it may be a command that is switched."""
-
-WHOLE = 0.05
-"""Part of a step by which multiples of it may be off: logs have few digits."""
+        f"{ENCODER} is read in steps of {step:.3g} {trial.unit(ENCODER)} in '{trial.name}': rounding alone is "
+        f"{part:.2g} of its span, and the class's `floor` takes {rig.floor:g} for noise: make it {part:.1g}"
+    ]
 
 
 def count_of(values: Array) -> float:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
-from hannes_description.output import finite, print_json
+from hannes_description.output import between, finite, print_json
 
 from .cli_files import Output, check_files, check_writable, deliver
 from .cli_options import (
@@ -234,11 +235,17 @@ def hide(
         make_set(hand, [entries[source]], seed=seed, closures=1, conditions=["fast"], scatter=0.0)
 
     check_own_effects(wanted, simulate, along_reference(trial, trial.reference))
-    how: dict[str, Any] = {"seed": seed, "closures": closures, "sensors": sensors}
-    how["conditions"] = conditions or DEFAULT_CONDITIONS
-    recordings, hidden = make_set(hand, list(entries.values()), **how)
+    asked = partial(
+        make_set,
+        hand,
+        seed=seed,
+        closures=closures,
+        sensors=sensors,
+        conditions=conditions or DEFAULT_CONDITIONS,
+    )
+    recordings, hidden = asked(list(entries.values()))
     if entries:
-        hidden = replace(hidden, visible=visibility(recordings, make_set(hand, [], **how)[0]))
+        hidden = replace(hidden, visible=visibility(recordings, asked([])[0]))
     bags = write_set(recordings, hidden, out, truth)
     if json:
         print_json({"bags": [str(b) for b in bags], "truth": str(truth)})
@@ -247,16 +254,11 @@ def hide(
     if hidden.visible:
         signals = dict.fromkeys(name for own in hidden.visible.values() for name in own)
         seen = {name: [own[name] for own in hidden.visible.values() if name in own] for name in signals}
-        told = ", ".join(f"{name} {' .. '.join(_ends(ratios))}" for name, ratios in seen.items())
+        told = ", ".join(f"{name} {between(min(own), max(own), 2)}" for name, own in seen.items())
         typer.echo(
             f"What is hidden moves the mean closure by {told} times the closures' scatter (over the conditions), "
             "before the hand's own parameters take over what they can."
         )
-
-
-def _ends(ratios: Sequence[float]) -> list[str]:
-    """Least and greatest of some numbers, once if they read the same."""
-    return list(dict.fromkeys(f"{ratio:.2g}" for ratio in (min(ratios), max(ratios))))
 
 
 def _check_factor(source: str, factor: float) -> None:

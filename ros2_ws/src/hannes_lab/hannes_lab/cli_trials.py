@@ -6,7 +6,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from hannes_description.output import TEXT_WIDTH, number, print_json, show_table, text_console, with_unit
+from hannes_description.output import (
+    TEXT_WIDTH,
+    between,
+    number,
+    print_json,
+    show_table,
+    text_console,
+    with_unit,
+)
 from hannes_description.signals import SIGNALS
 from rich.table import Table
 
@@ -95,13 +103,12 @@ def _show(read: Sequence[dict[str, Any]], notes: Sequence[str]) -> None:
         table.add_column(name, justify="left" if name in ("trial", "condition") else "right")
     for one in read:
         for c in one["conditions"]:
-            ends = dict.fromkeys((number(c["shortest"], 4), number(c["longest"], 4)))
             table.add_row(
                 one["name"],
                 str(len(one["recordings"])),
                 c["name"],
                 str(c["closures"]),
-                " .. ".join(ends),
+                between(c["shortest"], c["longest"]),
                 with_unit(1e3 * one["period"], "ms"),
             )
     show_table(table, TEXT_WIDTH)

@@ -164,11 +164,10 @@ def residual_dependences(
         "velocity": speed_unit,
         "load": of_signal[signal],
     }
+    speeds = [float(np.abs(values).mean()) for values in known.get("velocity", ())]
     found = [
         *_dependences(residuals, known, signal, steps, units),
-        *_oscillation(
-            signal, residuals[signal], steps, [float(np.abs(v).mean()) for v in known.get("velocity", ())]
-        ),
+        *_oscillation(signal, residuals[signal], steps, speeds),
     ]
     return tuple(sorted(found, key=lambda d: -d.telling))
 
@@ -279,7 +278,8 @@ def _oscillation(
     found = [(_spectrum(r, step), r.shape[1] * step) for r, step in zip(residuals, steps, strict=True)]
     spectra = [s for s, _ in found if s is not None]
     lengths = [length for s, length in found if s is not None]
-    paces = [pace for (s, _), pace in zip(found, speeds, strict=False) if s is not None] or lengths
+    of_all = speeds or [length for _, length in found]
+    paces = [pace for (s, _), pace in zip(found, of_all, strict=True) if s is not None]
     if not spectra or max(paces) < OTHER_SPEED * min(paces):
         return []
     lowest = BAND * CYCLES / min(lengths)

@@ -263,9 +263,8 @@ def _judge(
     if within:
         alike = [k for k in alike if held[k] <= AS_IT_REPEATS] or alike
     joins = [error <= math.sqrt(part) * before for error, part in zip(held, most, strict=True)]
-    alike = [
-        k for k in alike if joins[k]
-    ] or alike  # a simpler one that does not join is no end of the search
+    # A simpler one that does not join is no end of the search.
+    alike = [k for k in alike if joins[k]] or alike
     if not alike:
         return _Judged(judged[0], float("nan"), (), 1.0 - gain)
     for candidate in judged:

@@ -171,6 +171,7 @@ class PlantRig:
     floor, points, drive_signals, pooled, approximate, foreign, phases, machine, figures, experiments  see Rig
 
     one_mass     nothing is beyond a wire; `prepare` says so, which knows the model
+    law_used     the control law of the last simulation, with the gains that `run` gave it; None before
 
     Plants are built once per (model structure, trial) and then only re-parametrised.
     """

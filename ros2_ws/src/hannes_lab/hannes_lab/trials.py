@@ -550,10 +550,8 @@ def _kinds(shapes: Sequence[Array], ticks: float) -> list[list[int]]:
         """Largest difference as far as both go, in what it may be; infinite beyond."""
         one, other, n = shapes[k], shapes[m], min(sizes[k], sizes[m])
         most = 0.03 * min(heights[k], heights[m]) + max(slopes[k], slopes[m]) + 1e-9
-        for some in (
-            slice(0, n, max(1, n // 50)),
-            slice(0, n),
-        ):  # most that differ do so in a few samples already
+        few = max(1, n // 50)  # most that differ do so in a few samples already
+        for some in (slice(0, n, few), slice(0, n)):
             largest = float(np.max(np.abs(one[some] - other[some])))
             if not largest <= most:
                 return math.inf
@@ -565,8 +563,8 @@ def _kinds(shapes: Sequence[Array], ticks: float) -> list[list[int]]:
         near = np.minimum(sizes, sizes[k]) >= USUAL * np.maximum(sizes, sizes[k])
         return np.array([apart(k, m) if near[m] else math.inf for m in range(len(shapes))])
 
-    def alone(k: int) -> tuple[int, float]:
-        """Orders closures by how many of those that are left are like them, and how much."""
+    def rank(k: int) -> tuple[int, float]:
+        """How many of those that are left are like one, most first, and how much."""
         own = away(k)[left]
         like = own < math.inf
         return -int(like.sum()), float(own[like].sum())
@@ -575,7 +573,7 @@ def _kinds(shapes: Sequence[Array], ticks: float) -> list[list[int]]:
     kinds = []
     while left.size:
         some = left[np.unique(np.linspace(0, left.size - 1, min(left.size, MIDDLES)).astype(int))]
-        middle = int(min(some, key=alone))
+        middle = int(min(some, key=rank))
         own = away(middle)[left] < math.inf
         own |= left == middle
         kinds.append((middle, left[own].tolist()))
