@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
+import tempfile
 from ctypes import byref, c_double
 from pathlib import Path
 
 import numba
 import pytest
+from hannes_sim._compile_cache import use_source_keyed_cache
 from hannes_sim.native import CONTROL_SIGNATURE
 from numba.core.caching import IndexDataCacheFile
 
@@ -51,3 +53,20 @@ def test_a_full_disk_is_said_once(
     assert compiled() == compiled() == (6.0, 0)
     (said,) = caplog.messages
     assert str(folder) in said and "No space left on device" in said
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o700])
+def test_only_a_folder_of_ones_own_serves_where_there_is_no_home(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: int
+) -> None:
+    """numba runs what it reads in its cache: one that others may write is not used."""
+    (tmp_path / "no_folder").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "no_folder"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    first = use_source_keyed_cache()
+    assert first is not None and first.parent == tmp_path and first.stat().st_mode & 0o077 == 0
+    first.chmod(mode)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    assert (use_source_keyed_cache() == first) == (mode == 0o700)

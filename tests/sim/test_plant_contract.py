@@ -1,6 +1,7 @@
 """What every plant promises: units, determinism, rest, limits, sign of the motion; run on each plant and variant."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from hannes_control.double_pid import DoublePID
 from hannes_control.reference import half_sine
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.parameters import Parameter
 from hannes_sim.effect import load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.objects import RIGID_DYNAMOMETER, SOFT_BALL
@@ -24,8 +26,6 @@ MODELS: dict[str, Callable[[], Model]] = {
 
 
 def _variant(**options: str) -> Model:
-    from dataclasses import replace
-
     model = Model.load("nominal_mujoco")
     return replace(model, variant={**model.variant, **options})
 
@@ -71,6 +71,30 @@ def test_reset_repeats_bit_for_bit(plant: Plant, model: Model) -> None:
     reference = half_sine(1, amplitude=8.0, period=1.0)
     first, second = rollout(plant, law, reference), rollout(plant, law, reference)
     assert np.array_equal(first.raw, second.raw) and np.array_equal(first.motor_voltage, second.motor_voltage)
+
+
+def test_a_reading_has_what_the_effects_give_from_the_first_one_on(model: Model) -> None:
+    """An encoder whose zero is elsewhere, as an effect and as the parameter, is the same bit for bit."""
+    kind = load_effect("encoder_offset")
+    entry = kind.entry({"offset": 0.3})
+    law, reference = DoublePID.of_model(model.parameters), half_sine(1, amplitude=4.0, period=0.4)
+    as_effect, as_parameter = make_plant(model.with_effect(entry)), make_plant(model)
+    as_parameter.set("encoder.zero", 0.3)
+    for plant in (as_effect, as_parameter):
+        plant.reset()
+        assert plant.read().position == pytest.approx(0.3, abs=1e-3) and plant.read().velocity == 0.0
+    assert np.array_equal(rollout(as_effect, law, reference).raw, rollout(as_parameter, law, reference).raw)
+
+
+def test_an_amplifier_with_a_current_loop_feels_no_back_emf(model: Model) -> None:
+    speeds = []
+    for compensated in (0.0, 1.0):
+        own = Parameter(compensated, "1", 0.0, 1.0, "datasheet", "amplifier")
+        entries = {**model.parameters.entries, "motor.emf_compensated": own}
+        plant = make_plant(replace(model, parameters=replace(model.parameters, entries=entries)))
+        plant.advance(3.0, 400)
+        speeds.append(plant.read().velocity)
+    assert speeds[1] > 1.3 * speeds[0]
 
 
 def test_stepwise_equals_rollout(plant: Plant, model: Model) -> None:

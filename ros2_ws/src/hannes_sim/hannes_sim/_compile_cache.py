@@ -9,11 +9,13 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import stat
 import sys
 import tempfile
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +34,11 @@ def use_source_keyed_cache() -> Path | None:
     if given and given != os.environ.get(_OURS):
         return None
     package = Path(__file__).parent
-    digest = hashlib.sha256(version("numba").encode())
-    for source in sorted(package.rglob("*.py")):
+    # Compiled loops hold constants of MuJoCo and of the description package.
+    digest = hashlib.sha256(f"{version('numba')} {version('mujoco')}".encode())
+    described = find_spec("hannes_description")
+    folders = [package, *map(Path, (described and described.submodule_search_locations) or ())]
+    for source in sorted(file for folder in folders for file in folder.rglob("*.py")):
         digest.update(source.read_bytes())
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     folder = base / "hannes" / f"numba-{digest.hexdigest()[:16]}"
@@ -41,7 +46,12 @@ def use_source_keyed_cache() -> Path | None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
         folder = Path(tempfile.gettempdir()) / f"hannes-numba-{os.getuid()}-{digest.hexdigest()[:16]}"
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with suppress(FileExistsError):
+            folder.mkdir(mode=0o700, parents=True)
+        seen = folder.lstat()
+        if not stat.S_ISDIR(seen.st_mode) or seen.st_uid != os.getuid() or seen.st_mode & 0o022:
+            # numba runs what it reads there: never what somebody else may have put there
+            folder = Path(tempfile.mkdtemp(prefix="hannes-numba-"))
     os.environ["NUMBA_CACHE_DIR"] = os.environ[_OURS] = str(folder)
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = str(folder)

@@ -9,6 +9,7 @@ from numba import njit
 from .native import call_effect, pointer_f8, pointer_i8
 from .ports import (
     BRUSH,
+    CONTACT,
     CURRENT,
     DELAY,
     DELAY_RING,
@@ -21,6 +22,7 @@ from .ports import (
     H_READING,
     H_STATE,
     KT_REL,
+    LOAD,
     N_OUTPUTS,
     P_CURRENT_OFFSET,
     P_DELAY,
@@ -35,6 +37,7 @@ from .ports import (
     P_RESOLUTION,
     P_SUPPLY,
     P_ZERO,
+    QL,
     R_CURRENT,
     R_EFFORT,
     R_POSITION,
@@ -54,8 +57,10 @@ from .ports import (
     SENSE_CURRENT_GAIN,
     SENSE_POSITION,
     SUPPLY,
+    VL,
     VOLTAGE,
     VOLTAGE_DROP,
+    Q,
     T,
     V,
 )  # fmt: skip
@@ -127,13 +132,22 @@ def begin_step(handle, voltage, q, v):  # type: ignore[no-untyped-def]
         command = newer + part * (older - newer)
     x[T] = s[S_TIME_STEPS] * p[P_DT]
     x[DT] = p[P_DT]
-    x[2] = q
+    x[Q] = q
     x[V] = v
     x[CURRENT] = s[S_CURRENT]
     x[VOLTAGE] = command
     x[RESISTANCE] = p[P_RESISTANCE]
     x[SUPPLY] = limit
     return command
+
+
+@_compiled
+def stand(handle, q, ql):  # type: ignore[no-untyped-def]
+    """What the effects give of a machine that stands, so that the first reading of its sensors has it."""
+    begin_step(handle, 0.0, q, 0.0)
+    x = pointer_f8(handle[H_INPUTS])
+    x[QL], x[VL], x[LOAD], x[CONTACT] = ql, 0.0, 0.0, 0.0
+    evaluate_effects(handle)
 
 
 @_inlined

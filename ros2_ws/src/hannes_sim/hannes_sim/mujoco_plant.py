@@ -47,7 +47,7 @@ from numba import cfunc
 from numpy.typing import NDArray
 
 from .effect import BoundEffects
-from .motor import FASTEST, begin_step, evaluate_effects, motor_torque, sense, watch_outputs
+from .motor import FASTEST, begin_step, evaluate_effects, motor_torque, sense, stand, watch_outputs
 from .native import ADVANCE_SIGNATURE, call_2, pointer_f8, pointer_i8
 from .objects import GraspObject
 from .plant import DEFAULT_DT, NOT_NEGATIVE, POSITIVE, PlantDiverged, Reading
@@ -79,6 +79,7 @@ from .ports import (
     P_DELAY,
     P_DT,
     P_EFFICIENCY,
+    P_EMF_COMPENSATED,
     P_INDUCTANCE,
     P_INERTIA,
     P_KT,
@@ -230,6 +231,8 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
             s[S_LOAD] = (stiffness * (q - ql) + p[_WIRE_B] * (v - vl)) * r * r
         s[S_CONTACT] = sensors[count[_C_GRIP]] * p[_TIP] if count[_C_GRIP] >= 0 else 0.0
 
+    if steps == 0:
+        stand(handle, q, ql)
     sense(handle, q, steps)
     out[R_FORCE] = sensors[count[_C_GRIP]] if count[_C_GRIP] >= 0 else 0.0
     out[R_Q], out[R_QL], out[R_LOAD], out[R_VL] = q, ql, s[S_LOAD], vl
@@ -275,6 +278,7 @@ _NAMES = {
     "motor.resistance": P_RESISTANCE,
     "motor.inductance": P_INDUCTANCE,
     "motor.kt": P_KT,
+    "motor.emf_compensated": P_EMF_COMPENSATED,
     "gear.efficiency": P_EFFICIENCY,
     "encoder.resolution": P_RESOLUTION,
     "encoder.zero": P_ZERO,
@@ -568,7 +572,9 @@ class MujocoPlant:
         self._outputs[:] = 0.0
         self._delay[:] = 0.0
         self.reading[:] = 0.0
-        self._call(self._handle_pointer, 0.0, 0)
+        with watched():  # what an effect raises is said at the first step
+            self._call(self._handle_pointer, 0.0, 0)
+        self.effects.states[:] = 0.0
 
     def advance(self, voltage: float, steps: int) -> None:
         with watched() as raised:

@@ -26,7 +26,7 @@ from numba import cfunc
 from numpy.typing import NDArray
 
 from .effect import BoundEffects
-from .motor import begin_step, dry_friction, evaluate_effects, motor_torque, sense, watch_outputs
+from .motor import begin_step, dry_friction, evaluate_effects, motor_torque, sense, stand, watch_outputs
 from .native import ADVANCE_SIGNATURE, pointer_f8
 from .objects import GraspObject
 from .plant import DEFAULT_DT, NOT_NEGATIVE, POSITIVE, PlantDiverged, Reading
@@ -134,6 +134,8 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
     dt = p[P_DT]
     q, v, ql, vl = s[_SQ], s[_SV], s[_SQL], s[_SVL]
     place, speed, load, contact = q + ql, v, s[S_LOAD], s[S_CONTACT]
+    if steps == 0:
+        stand(handle, q, ql)
     for _ in range(steps):
         command = begin_step(handle, voltage, q, v)
         x[QL], x[VL], x[LOAD], x[CONTACT] = ql, vl, load, contact
@@ -330,7 +332,9 @@ class ReducedPlant:
         self._outputs[:] = 0.0
         self._delay[:] = 0.0
         self.reading[:] = 0.0
-        self._call(self._handle_pointer, 0.0, 0)
+        with watched():  # what an effect raises is said at the first step
+            self._call(self._handle_pointer, 0.0, 0)
+        self.effects.states[:] = 0.0
 
     def advance(self, voltage: float, steps: int) -> None:
         with watched() as raised:
