@@ -105,7 +105,7 @@ class Case:
 def missing(method: str) -> str | None:
     """Why a method cannot run here."""
     if method == "sindy" and importlib.util.find_spec("pysindy") is None:
-        return "pysindy is not installed (requirements/dev.txt)"
+        return "pysindy is not installed (requirements/bench.txt)"
     if method == "sysid":
         import mujoco.sysid
 

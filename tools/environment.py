@@ -253,7 +253,8 @@ def requirements_lines(apt_ros: bool) -> list[str]:
     own = {package.name for package in package_folders()}
     found: set[str] = set(lines((ROOT / "requirements" / "dev.txt").read_text()))
     if not apt_ros:
-        found.update(lines((ROOT / "requirements" / "colcon.txt").read_text()))
+        for name in ("colcon.txt", "bench.txt"):
+            found.update(lines((ROOT / "requirements" / name).read_text()))
     for package in package_folders():
         required, extras = declared(package)
         found.update(line for line in required if line not in own)

@@ -59,6 +59,31 @@ def test_beside_an_apt_ros_no_wheel_of_ros_is_installed(tool: ModuleType) -> Non
     assert pins(tool.constraints_text(apt_ros=True))["numpy"] == "1.26.4"
 
 
+def test_what_is_installed_beside_an_apt_ros_agrees_with_its_numpy(tool: ModuleType) -> None:
+    """What the packages that are asked for require of one another, against the pins, as far as their versions are here."""
+    from importlib import metadata
+
+    from packaging.requirements import Requirement
+
+    pinned = pins(tool.constraints_text(apt_ros=True))
+    todo, done, apart = [Requirement(line) for line in tool.requirements_lines(apt_ros=True)], set(), []
+    while todo:
+        requirement = todo.pop()
+        name = re.sub(r"[-_.]+", "-", requirement.name).lower()
+        if name in pinned and not requirement.specifier.contains(pinned[name]):
+            apart.append(f"{requirement} with {name} {pinned[name]}")
+        if name in done or name not in pinned:
+            continue
+        done.add(name)
+        if metadata.version(name) != pinned[name]:
+            continue  # of a version that is not here nothing is known
+        for text in metadata.distribution(name).requires or []:
+            child = Requirement(text)
+            if child.marker is None or child.marker.evaluate({"extra": ""}):
+                todo.append(child)
+    assert "numpy" in done and not apart
+
+
 def test_this_environment_has_the_pinned_versions(tool: ModuleType) -> None:
     from importlib import metadata
 
