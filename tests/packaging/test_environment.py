@@ -60,7 +60,7 @@ def test_beside_an_apt_ros_no_wheel_of_ros_is_installed(tool: ModuleType) -> Non
 
 
 def test_what_is_installed_beside_an_apt_ros_agrees_with_its_numpy(tool: ModuleType) -> None:
-    """What the packages that are asked for require of one another, against the pins, as far as their versions are here."""
+    """What is asked for requires of one another no version but the pinned one, as far as those are here."""
     from importlib import metadata
 
     from packaging.requirements import Requirement
