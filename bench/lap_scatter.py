@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 from hannes_description.model import Model
-from hannes_lab.fit import fit, over_its_spread
+from hannes_lab.fit import fit
 from hannes_lab.intervals import NORMAL, sway
 from hannes_lab.prepare import prepare
 from hannes_lab.problem import effect_coordinates, nuisance_coordinate, vanishing_entry
 from hannes_lab.rig import load_rig
+from hannes_lab.secants import over_its_spread
 from hannes_sim.effect import load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.rollout import rollout

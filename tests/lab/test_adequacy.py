@@ -7,7 +7,6 @@ from hannes_description.model import Model
 from hannes_lab.adequacy import distorted, exaggerated, in_the_law, leads_back, led_off
 from hannes_lab.diagnose import effect_sources
 from hannes_lab.fit import Fit
-from hannes_lab.hand import WIDE_STEP
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.problem import Coordinate, effect_coordinates, nuisance_coordinate
@@ -26,8 +25,8 @@ def candidate(*off: tuple[Coordinate, float]) -> Candidate:
 def test_what_leads_a_known_parameter_back_is_worth_more() -> None:
     """Where the hand's own spring has taken over a glove, a little gain tells whose it was."""
     spring, wire = (
-        nuisance_coordinate(Nuisance(name, 1.0, sd, True, step=step))
-        for name, sd, step in (("hand.stiffness", 0.05, 0.5), ("wire.stiffness", 1.0, WIDE_STEP))
+        nuisance_coordinate(Nuisance(name, 1.0, sd, True, wide=wide))
+        for name, sd, wide in (("hand.stiffness", 0.05, False), ("wire.stiffness", 1.0, True))
     )
     assert wire.wide and not spring.wide
     base = candidate((spring, 5.0), (wire, 0.0))
@@ -40,8 +39,8 @@ def test_what_leads_a_known_parameter_back_is_worth_more() -> None:
 def test_effects_that_take_a_known_parameter_far_off_replace_what_the_model_had() -> None:
     """A drag that grows with the square of the speed is bent into a breakaway friction without any dry friction."""
     dry, wire = (
-        nuisance_coordinate(Nuisance(name, 0.02, sd, True, step=step))
-        for name, sd, step in (("friction.coulomb", 0.1, 0.5), ("wire.stiffness", 1.0, WIDE_STEP))
+        nuisance_coordinate(Nuisance(name, 0.02, sd, True, wide=wide))
+        for name, sd, wide in (("friction.coulomb", 0.1, False), ("wire.stiffness", 1.0, True))
     )
     base = candidate((dry, -1.3), (wire, 0.0))
     said = led_off(base, candidate((dry, -9.0), (wire, 0.0)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -188,30 +188,6 @@ def spread(found: Fit) -> dict[str, float]:
     return out
 
 
-def over_its_spread(problem: Problem, found: Fit) -> Fit:
-    """The fit with each derivative as the secant over the parameter's own standard deviation, for the covariance.
-
-    The standard deviation depends on the derivatives, so they are taken twice.
-    """
-    for _ in range(2):
-        jacobian, steps = found.jacobian.copy(), spread(found)
-        for j, c in enumerate(found.coordinates):
-            z, (low, high) = float(found.z[j]), c.bounds
-            ends = max(z - steps[c.name], low), min(z + steps[c.name], high)
-            there = [(z, found.residual)]
-            for end in ends:
-                failures = problem.failures
-                residual = problem.residual(found.model, {**found.values, c.name: c.value(end)})
-                if problem.failures == failures:
-                    there.append((end, residual))
-            # The residual at the fit serves where one end diverges.
-            (a, before), (b, after) = there[-2:] if len(there) > 1 else there * 2
-            if b != a:
-                jacobian[:, j] = (after - before) / (b - a)
-        found = replace(found, jacobian=jacobian)
-    return without_scale(problem, found)
-
-
 KEPT = 0.6
 MISSED = 0.02
 """Derivatives are taken anew after a step that lowered the cost by less than this part of what they promised, or that
@@ -242,29 +218,6 @@ UNSEEN = 1e-3
 """Where only a part of the features takes part in a fit: weight with which a strength or a shape without a prior is
 drawn to where it vanishes, or is typical.  Else what that part does not show of it would stay at the start, which may
 have been fitted to the rest."""
-
-
-def without_scale(problem: Problem, found: Fit) -> Fit:
-    """The fit with derivatives that tell no more of a factor on all forces than a simulation shows of it.
-
-    Each force by itself moves the data much, and all together little: as a difference of their derivatives that is
-    mostly roughness.  By so much as the priors leave it open, the factor is simulated, and where that moves the data
-    less than the derivatives say, they are made to say what it does.
-    """
-    forces = Forces(found.coordinates, found.z, scaling(problem, found.model))
-    along = forces.direction()
-    slope = prior_weights(found.coordinates) * along
-    if not slope.any():
-        return found
-    step = 1.0 / float(np.linalg.norm(slope))
-    moved = forces.scaled(step)
-    values = {c.name: c.value(float(z)) for c, z in zip(found.coordinates, moved, strict=True)}
-    failures = problem.failures
-    seen = (problem.residual(found.model, values) - found.residual) / step
-    said = found.jacobian @ along
-    if problem.failures > failures or not np.linalg.norm(seen) < np.linalg.norm(said):
-        return found
-    return replace(found, jacobian=found.jacobian + np.outer(seen - said, along) / float(along @ along))
 
 
 class Derivatives:

@@ -57,9 +57,6 @@ IN_COMMON = 0.2
 """An outer loop shows where current and position error have this in common at least: of hands whose gains are known
 they had 0.88 and more, and 0.07 where fast closures alone, rectified at 30 Hz, gave fourteen times the gain."""
 
-WIDE_STEP = 0.1
-"""Step of finite differences where the prior is wide: half of its width leads past every bend of the signals."""
-
 _UNKNOWN_ZERO_SD = 0.1
 """rad; what a hand calls open whose homing nobody described."""
 
@@ -286,15 +283,14 @@ class HandRig(PlantRig):
                     plant, _, _ = self._plant(model.without_effects(), trial)
                     known = is_of(trial, model) and not trial.options.get("object_seen")
                     width = sd if known else _UNKNOWN_OBJECT_SD[name]
-                    step = 0.5 if known else WIDE_STEP
                     place = f"{name}@{trial.name}"
                     unit = _OBJECT_UNITS[name]
-                    out.append(Nuisance(place, plant.get(name), width, relative, scatter, unit, step))
+                    out.append(Nuisance(place, plant.get(name), width, relative, scatter, unit, not known))
                     damping = "object.damping"
                     if name == "object.stiffness" and not known and damping in plant.names:
                         place = f"{damping}@{trial.name}"
                         unit, width = _OBJECT_UNITS[damping], _UNKNOWN_DAMPING_SD
-                        own = Nuisance(place, plant.get(damping), width, True, 0.0, unit, WIDE_STEP)
+                        own = Nuisance(place, plant.get(damping), width, True, 0.0, unit, wide=True)
                         out.append(replace(own, effect="object_damping"))
             elif name == _ZERO:
                 if sum(map(is_described, self.trials)) > 1:
@@ -307,7 +303,7 @@ class HandRig(PlantRig):
                         False,
                         scatter,
                         "rad",
-                        step=0.5 if is_described(trial) else WIDE_STEP,
+                        wide=not is_described(trial),
                         apart=math.inf if is_described(trial) else _APART,
                     )
                     for trial in self.trials
@@ -316,7 +312,7 @@ class HandRig(PlantRig):
                 own = self._nuisance(name, entry, model)
                 less = other and name in _DRY_FRICTION
                 out.append(replace(own, below=LESS_FRICTION * own.mean) if less else own)
-        return out + [replace(n, step=WIDE_STEP) for n in self._bench_nuisances(model)]
+        return out + [replace(n, wide=True) for n in self._bench_nuisances(model)]
 
     def _of_others(self, model: Model) -> list[Trial]:
         """Recordings of another machine than the model's."""

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
 from .features import Block, Features, alike
-from .rig import Nuisance, Rig
+from .rig import STEP, WIDE_STEP, Nuisance, Rig
 
 Array = NDArray[np.float64]
 Part = tuple[NDArray[np.int64], Array]
@@ -59,6 +59,7 @@ class Coordinate:
     scale    value = offset + scale z, or offset exp(scale z) if log
     part     True for a part of a whole
     form     True for a shape of an effect of which a usual value is known
+    wide     True for a nuisance parameter whose prior tells next to nothing
     below    scale of z below 0 if it is another, or, if log, value = offset (1 + below z) there; 0: as above it
     """
 
@@ -73,17 +74,13 @@ class Coordinate:
     unit: str = ""
     part: bool = False
     form: bool = False
+    wide: bool = False
     below: float = 0.0
 
     @property
     def nuisance(self) -> bool:
         """True for a parameter of the machine or of a recording, not of an effect."""
         return self.prior and not self.form
-
-    @property
-    def wide(self) -> bool:
-        """True for a nuisance parameter with a wide prior: its step, in standard deviations, is a small one."""
-        return self.prior and self.step < Nuisance.step
 
     def scale_at(self, z: float) -> float:
         """What a unit of z is at z: of the value, or of its logarithm."""
@@ -142,7 +139,8 @@ class Coordinate:
 
 
 def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
-    """z in standard deviations of the prior; a step of half of one is well above the simulation's own roughness."""
+    """z in standard deviations of the prior."""
+    usual = WIDE_STEP if nuisance.wide else STEP
     return Coordinate(
         nuisance.name,
         nuisance.mean,
@@ -151,8 +149,9 @@ def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
         nuisance.lower,
         nuisance.upper,
         True,
-        nuisance.step,
+        usual if nuisance.step is None else nuisance.step,
         nuisance.unit,
+        wide=nuisance.wide,
         below=nuisance.below,
     )
 
@@ -162,7 +161,7 @@ def effect_coordinates(effect: EffectType) -> list[Coordinate]:
     out = []
     for p in effect.parameters:
         if p.sd:
-            name, step = f"{effect.name}.{p.name}", Nuisance.step
+            name, step = f"{effect.name}.{p.name}", STEP
             out.append(
                 Coordinate(
                     name, p.typical, p.sd, False, p.lower, p.upper, True, step, p.unit, p.part, form=True

@@ -50,6 +50,12 @@ REMEMBERED = 48
 """Simulations whose signals are kept: those of a whole Jacobian of three trials."""
 
 
+STEP = 0.5
+WIDE_STEP = 0.1
+"""Steps of finite differences in standard deviations of a prior: half of one is well above the simulation's own
+roughness, but half the width of a wide prior leads past every bend of the signals."""
+
+
 @dataclass(frozen=True)
 class Nuisance:
     """A nominal parameter that is not known exactly; the fit may move it within its prior.
@@ -59,7 +65,8 @@ class Nuisance:
     sd           standard deviation of the prior, in the parameter's unit, or of its logarithm if `log`
     log          positive parameter, treated on a logarithmic scale
     closure_sd   scatter from closure to closure, same scale as sd
-    step         of finite differences, in sd: small where the prior is wide
+    wide         True where the prior tells next to nothing: another value is no sign that an effect is missing
+    step         of finite differences, in sd; None: STEP, or WIDE_STEP where the prior is wide
     lower, upper  least and largest value
     apart        sd that the one of a recording may be from the mean over all recordings; beyond, no set of effects is
                  adequate
@@ -74,7 +81,8 @@ class Nuisance:
     log: bool
     closure_sd: float = 0.0
     unit: str = ""
-    step: float = 0.5
+    wide: bool = False
+    step: float | None = None
     lower: float = -math.inf
     upper: float = math.inf
     apart: float = math.inf

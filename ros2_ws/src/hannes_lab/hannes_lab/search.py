@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .cache import Codec, NotPlain, Store, code_hash, content_hash
 from .errors import SignalError
 from .executor import Executor, Held, own
-from .fit import Fit, finite_differences, fit, over_its_spread, spread
+from .fit import Fit, finite_differences, fit, spread
 from .problem import (
     Coordinate,
     Counts,
@@ -30,6 +30,7 @@ from .problem import (
 )
 from .rig import Nuisance
 from .scan import Scan, Scored, farthest, point_key, shapes_of, tried_periods
+from .secants import over_its_spread
 from .settle import MOVES, at_anchor, least_gain, seen_from, settle, slopes_at
 from .surrogate import AnchoredRig, anchored_at
 
