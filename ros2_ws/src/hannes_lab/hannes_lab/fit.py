@@ -90,15 +90,17 @@ class Fit:
         """Covariance (k, k) of z from the curvature at the optimum, with the priors.
 
         What moves nothing, and what only moves with another, has a very large variance.
+
+        inflate  factor by which the data's noise is larger than the whitening says; tolerances are what they are
         """
-        curvature = self.jacobian.T @ self.jacobian + np.diag(
+        curvature = self.jacobian.T @ self.jacobian / inflate + np.diag(
             [1.0 if c.prior else 1e-6 for c in self.coordinates]
         )
         # Columns differ by many orders of magnitude: scaled to one another first, none is lost to rounding.
         unit = np.sqrt(np.diag(curvature))
         sizes, along = np.linalg.eigh(curvature / np.outer(unit, unit))
         inverse = (along / np.maximum(sizes, SINGULAR)) @ along.T
-        return np.asarray(inverse / np.outer(unit, unit) * inflate, dtype=np.float64)
+        return np.asarray(inverse / np.outer(unit, unit), dtype=np.float64)
 
     def sd(self, inflate: float = 1.0) -> Array:
         """Standard deviations (k,) of z, see covariance."""
