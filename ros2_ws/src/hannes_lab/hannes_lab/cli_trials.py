@@ -15,7 +15,6 @@ from hannes_description.output import (
     text_console,
     with_unit,
 )
-from hannes_description.signals import SIGNALS
 from rich.table import Table
 
 from .cli_options import Bags, Json, Objects, RigFile, Scale, Topics
@@ -43,7 +42,7 @@ def trials(
 
     machine, read_in = trials_from(bags, objects, rig, scale, topics)
     found = as_compared(read_in, machine)
-    read = [told(trial, "" if machine else SIGNALS["reference_position"].unit) for trial in found]
+    read = [told(trial) for trial in found]
     notes = notes_of(found)
     if json:
         print_json({"trials": read, "notes": notes})
@@ -51,11 +50,12 @@ def trials(
         _show(read, notes)
 
 
-def told(trial: Trial, unit: str = "") -> dict[str, Any]:
+def told(trial: Trial) -> dict[str, Any]:
     """A trial in numbers: times in s, a rate in Hz (the median of its samples), ranges in the signal's unit.
 
-    unit  of the reference, where the trial does not say it (`units`)
+    A reference whose unit the trial does not say (`units`) is in that of the encoder, if one is recorded.
     """
+    followed = trial.unit("encoder_position") if "encoder_position" in trial.signals else ""
     conditions = []
     for name in trial.conditions:
         own = trial.of(name)
@@ -69,7 +69,7 @@ def told(trial: Trial, unit: str = "") -> dict[str, Any]:
                 "starts": [c.start for c in own],
             }
         )
-    signals = [_signal("reference", trial.units.get("reference", unit), trial.reference, trial.period)]
+    signals = [_signal("reference", trial.units.get("reference", followed), trial.reference, trial.period)]
     for name, (time, values) in trial.signals.items():
         step = float(np.median(np.diff(time))) if time.size > 1 else float("nan")
         signals.append(_signal(name, trial.unit(name), values, step))
@@ -119,7 +119,8 @@ def _show(read: Sequence[dict[str, Any]], notes: Sequence[str]) -> None:
         for s in one["signals"]:
             rate = "" if s["rate"] is None else number(s["rate"], 4)
             low, high = number(s["lowest"], 4), number(s["highest"], 4)
-            table.add_row(one["name"], s["name"], str(s["samples"]), rate, low, high, s["unit"])
+            name = "reference, replayed" if s["name"] == "reference" else s["name"]
+            table.add_row(one["name"], name, str(s["samples"]), rate, low, high, s["unit"])
     show_table(table, TEXT_WIDTH)
     for note in notes:
         console.print(f"note: {note}", style="dim")

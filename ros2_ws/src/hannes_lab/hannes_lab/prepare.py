@@ -27,6 +27,7 @@ from .lags import with_one_clock
 from .law_check import law_notes
 from .own_law import check_own_code
 from .problem import Problem, build_problem, nuisance_coordinate
+from .report_text import listed
 from .rig import Nuisance, PlantRig, Rig, check_parameters
 from .settle import settle
 from .surrogate import rig_for
@@ -149,6 +150,7 @@ def without_outliers(trial: Trial) -> Trial:
     kept: list[Closure] = []
     dropped: list[Closure] = []
     said: list[str] = []
+    apart: dict[str, float] = {}
     for condition in trial.conditions:
         closures = trial.of(condition)
         if len(closures) < 5:
@@ -166,12 +168,16 @@ def without_outliers(trial: Trial) -> Trial:
             needed = trial.anew and closure.start < trial.parts[1].begin
             (dropped if far > OUTLIER and not needed else kept).append(closure)
         if FIRST_APART < distance[0] <= OUTLIER:
-            of = f" of '{condition}'" if len(trial.conditions) > 1 else ""
-            said.append(
-                f"the first closure{of} is {distance[0]:.1f} times as far from the median closure as half of them are: "
-                f"it stays (from {OUTLIER:g} times on it is left out), counts as scatter, and errors look small "
-                "against that"
-            )
+            apart[condition] = float(distance[0])
+    if apart:
+        several = len(trial.conditions) > 1
+        of = f" of {listed([repr(c) for c in apart])}" if several else ""
+        is_, it = ("is", "it stays") if len(apart) == 1 else ("are", "they stay")
+        said.append(
+            f"the first closure{of} {is_} {listed([f'{far:.1f}' for far in apart.values()])} times as far from the "
+            f"median closure as half of them are: {it} (from {OUTLIER:g} times on one is left out) and count"
+            f"{'s' if len(apart) == 1 else ''} as scatter, and errors look small against that"
+        )
     if dropped:
         several = len(trial.conditions) > 1
         note = f"{len(dropped)} closure(s) far from the others are left out, starting at " + ", ".join(
