@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -306,6 +306,64 @@ def linear_minimum(jacobian: Array, residual: Array, z: Array, prior: Array) -> 
     return float(left @ left + (prior * there) @ (prior * there)), there
 
 
+@dataclass
+class _Objective:
+    """What a fit lowers: whitened residual (size,) and priors at a point z (k,).
+
+    use     (size,) features that take part
+    priors  (k,) weights of z
+    """
+
+    problem: Problem
+    model: Model
+    coordinates: tuple[Coordinate, ...]
+    use: Mask
+    priors: Array
+    kept: dict[bytes, Array] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, problem: Problem, model: Model, coordinates: tuple[Coordinate, ...], rows: Mask | None
+    ) -> _Objective:
+        """Of all features, or of some (see UNSEEN)."""
+        priors = prior_weights(coordinates)
+        if rows is None:
+            return cls(problem, model, coordinates, np.ones(problem.features.size, dtype=bool), priors)
+        return cls(problem, model, coordinates, rows, np.maximum(priors, UNSEEN))
+
+    def residual(self, z: Array) -> Array:
+        """Whitened residual (size,) of all features; the last ones are kept."""
+        key = z.tobytes()
+        if key not in self.kept:
+            if len(self.kept) > 4:
+                self.kept.clear()
+            values = {c.name: c.value(float(v)) for c, v in zip(self.coordinates, z, strict=True)}
+            self.kept[key] = self.problem.residual(self.model, values)
+        return self.kept[key]
+
+    def misfit(self, r: Array) -> float:
+        return float(r[self.use] @ r[self.use])
+
+    def cost(self, r: Array, z: Array) -> float:
+        return self.misfit(r) + self.penalty(z)
+
+    def penalty(self, z: Array) -> float:
+        """What the priors ask for a point."""
+        return float((self.priors * z) @ (self.priors * z))
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds (k,) of z."""
+        low, high = np.array([c.bounds for c in self.coordinates]).reshape(-1, 2).T
+        return low, high
+
+    def inside(self, z: Array) -> Array:
+        """The point a little inside its bounds."""
+        (low, high), own = self.bounds, prior_weights(self.coordinates) > 0.0
+        edge = np.where(own, OFF_BOUND, 1e-9)
+        return np.clip(z, low + edge, high - edge)
+
+
 def fit(
     problem: Problem,
     model: Model,
@@ -332,105 +390,95 @@ def fit(
     worth        a search ends early where the straight lines lead to no cost below this, have little left to gain, and
                  promise much the same as a step ago
     """
-    coordinates = tuple(coordinates)
-    known = known or {}
-    z0 = (
-        np.array([start.get(c.name, 0.0) for c in coordinates])
-        if isinstance(start, Mapping)
-        else np.array(start)
-    )
-    bounds = np.array([c.bounds for c in coordinates]).T if coordinates else np.zeros((2, 0))
-    priors = prior_weights(coordinates)
-    edge = np.where(priors > 0.0, OFF_BOUND, 1e-9)
-    use = np.ones(problem.features.size, dtype=bool) if rows is None else rows
-    if rows is not None:
-        priors = np.maximum(priors, UNSEEN)
-    cache: dict[bytes, Array] = {}
-
-    def residual_at(z: Array) -> Array:
-        key = z.tobytes()
-        if key not in cache:
-            if len(cache) > 4:
-                cache.clear()
-            cache[key] = problem.residual(
-                model, {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
-            )
-        return cache[key]
-
-    def cost(r: Array, z: Array) -> float:
-        return float(r[use] @ r[use] + (priors * z) @ (priors * z))
-
+    coordinates, known = tuple(coordinates), known or {}
+    objective = _Objective.of(problem, model, coordinates, rows)
+    if not coordinates:
+        r = problem.residual(model, {})
+        return Fit(model, (), np.zeros(0), objective.misfit(r), r, np.zeros((r.size, 0)))
+    if isinstance(start, Mapping):
+        start = np.array([start.get(c.name, 0.0) for c in coordinates])
     most = evaluations * (1 + sum(c.name not in known for c in coordinates))
-    derivatives = Derivatives(problem, model, coordinates, known, steps or {}, cost, most)
+    derivatives = Derivatives(problem, model, coordinates, known, steps or {}, objective.cost, most)
+    z, complete = _descend(objective, derivatives, objective.inside(start), little, worth)
+    if rows is not None:
+        z = _unseen_at_rest(objective, derivatives, z)
+    if complete:
+        z = _at_the_liked_factor(objective, z)
+    r = objective.residual(z)
+    if exact and not derivatives.fresh:
+        derivatives.forget()
+    jacobian = derivatives.at(z, r)
+    return Fit(model, coordinates, z, objective.cost(r, z), r, jacobian, complete)
 
-    promised: list[float] = []
 
-    def search_direction(z: Array) -> Array:
-        r = residual_at(z)
+def _descend(
+    objective: _Objective, derivatives: Derivatives, z: Array, little: float, worth: float
+) -> tuple[Array, bool]:
+    """Where least squares end from a point z (k,), and True; or where they were found not worth it, and False."""
+    use, priors, promised = objective.use, objective.priors, list[float]()
+
+    def jacobian_of(z: Array) -> Array:
+        r = objective.residual(z)
         jacobian = derivatives.at(z, r)[use]
         if worth < np.inf:
             promised.append(linear_minimum(jacobian, r[use], z, priors)[0])
             short = promised[-1] - worth
-            to_gain = cost(r, z) - promised[-1]
+            to_gain = objective.cost(r, z) - promised[-1]
             if len(promised) > 1 and short > max(to_gain, PATIENCE * abs(promised[-2] - promised[-1])):
                 raise _NotWorth
         return np.vstack([jacobian, np.diag(priors)])
 
-    if not coordinates:
-        r = problem.residual(model, {})
-        return Fit(model, (), np.zeros(0), float(r[use] @ r[use]), r, np.zeros((r.size, 0)))
-    inside = np.clip(z0, bounds[0] + edge, bounds[1] - edge)
-    z, complete, simulated, samples = inside, True, 0, int(np.count_nonzero(use))
+    simulated, samples = 0, int(np.count_nonzero(use))
     try:
         while True:
             found = least_squares(
-                lambda z: np.concatenate([residual_at(z)[use], priors * z]),
+                lambda z: np.concatenate([objective.residual(z)[use], priors * z]),
                 z,
-                jac=search_direction,
-                bounds=(bounds[0], bounds[1]),
+                jac=jacobian_of,
+                bounds=objective.bounds,
                 method="trf",
-                max_nfev=max(1, most - derivatives.taken - simulated),
+                max_nfev=max(1, derivatives.most - derivatives.taken - simulated),
                 ftol=1e-5,
                 xtol=1e-5,
                 gtol=1e-8,
                 x_scale=1.0,
             )
-            gain = cost(residual_at(z), z) - 2.0 * found.cost
+            gain = objective.cost(objective.residual(z), z) - 2.0 * found.cost
             z, simulated = found.x, simulated + found.nfev
             if (
-                simulated + derivatives.taken >= most
+                simulated + derivatives.taken >= derivatives.most
                 or derivatives.fresh
                 or gain < max(LEAST_GAIN, little * (2.0 * found.cost - samples))
             ):
-                break
+                return z, True
             derivatives.forget()
     except _NotWorth:
-        z, complete = derivatives.z, False
-    r = residual_at(z)
-    if rows is not None:
-        # What is drawn by so little may not arrive before a fit ends.
-        moves = np.linalg.norm(derivatives.at(z, r)[use], axis=0)
-        unseen = (moves <= UNSEEN) & (prior_weights(coordinates) == 0.0) & (z != 0.0)
-        if unseen.any():
-            z = np.where(unseen, np.clip(0.0, bounds[0] + edge, bounds[1] - edge), z)
-            r = residual_at(z)
-    if complete:
-        forces = Forces(coordinates, z, scaling(problem, model))
-        whole = forces.likeliest(priors)
-        for part in FACTOR_PARTS:
-            other = np.clip(forces.scaled(part * whole), bounds[0] + edge, bounds[1] - edge)
-            gain = (priors * z) @ (priors * z) - (priors * other) @ (priors * other)
-            if gain <= LEAST_GAIN:  # not worth a simulation
-                break
-            # What the data tell of it, one way or the other (or by the roughness of a bad fit), is for the search.
-            there = residual_at(other)
-            if abs(there[use] @ there[use] - r[use] @ r[use]) < gain:
-                z, r = other, there
-                break
-    if exact and not derivatives.fresh:
-        derivatives.forget()
-    jacobian = derivatives.at(z, r)
-    return Fit(model, coordinates, z, cost(r, z), r, jacobian, complete)
+        return derivatives.z, False
+
+
+def _unseen_at_rest(objective: _Objective, derivatives: Derivatives, z: Array) -> Array:
+    """The point with what the features that take part do not show put where it vanishes, or is typical (see UNSEEN):
+    what is drawn by so little may not arrive before a fit ends."""
+    moves = np.linalg.norm(derivatives.at(z, objective.residual(z))[objective.use], axis=0)
+    unseen = (moves <= UNSEEN) & (prior_weights(objective.coordinates) == 0.0) & (z != 0.0)
+    return np.where(unseen, objective.inside(np.zeros(z.size)), z)
+
+
+def _at_the_liked_factor(objective: _Objective, z: Array) -> Array:
+    """The point with all forces by the factor that the priors like best, where the data do not tell it (see Forces).
+
+    What the data tell of it, one way or the other (or by the roughness of a bad fit), is for the search.
+    """
+    forces = Forces(objective.coordinates, z, scaling(objective.problem, objective.model))
+    whole, misfit = forces.likeliest(objective.priors), objective.misfit(objective.residual(z))
+    for part in FACTOR_PARTS:
+        other = objective.inside(forces.scaled(part * whole))
+        gain = objective.penalty(z) - objective.penalty(other)
+        if gain <= LEAST_GAIN:  # not worth a simulation
+            break
+        if abs(objective.misfit(objective.residual(other)) - misfit) < gain:
+            return other
+    return z
 
 
 def nuisance_table(
