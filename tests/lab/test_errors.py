@@ -1,11 +1,21 @@
 """What took no part in a fit must not be known to it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from hannes_description.model import Model
-from hannes_lab.errors import SignalError, held_out_condition_errors, held_out_conditions, overall
+from hannes_lab.errors import (
+    SignalError,
+    apart_alone,
+    held_out_condition_errors,
+    held_out_conditions,
+    overall,
+    signal_errors,
+)
+from hannes_lab.features import Block
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.search import Candidate, Search
@@ -61,3 +71,28 @@ def test_what_another_condition_of_the_recording_tells_is_not_fitted_to_the_left
     search = Search(prepared.problem, model, prepared.nuisances, {})
     position = next(e for e in left_out(search, search.null())["late"] if e.signal == "encoder_position")
     assert position.rmse == pytest.approx(0.2, rel=0.02)
+
+
+def blocks_of(biases: dict[str, float], seed: int = 0) -> tuple[Any, list[np.ndarray]]:
+    """Two conditions of three repeats and some of one, noise of 1 a sample, predicted as 0; means other by `biases`."""
+    rng, phase = np.random.default_rng(seed), np.linspace(0.0, 1.0, 200)
+    empty = np.zeros((0, 0), dtype=np.int64)
+
+    def block(condition: str, n: int) -> Block:
+        measured = rng.normal(size=(n, phase.size)) + biases.get(condition, 0.0)
+        return Block(0, condition, "motor_current", phase, measured, (empty, empty, empty), None, "A")
+
+    blocks = [block("slow", 3), block("fast", 3), *(block(name, 1) for name in ("once", "twice", "thrice"))]
+    features: Any = SimpleNamespace(blocks=tuple(blocks))
+    return features, [np.zeros_like(b.measured) for b in blocks]
+
+
+def test_a_bias_of_what_was_recorded_once_is_no_repeatability() -> None:
+    """Over all conditions its error is hardly more than the others repeat; a noise of the same size is none."""
+    features, predicted = blocks_of({"once": 1.2, "twice": 0.1})
+    (one,) = apart_alone(features, predicted, 1.25)
+    assert one.condition == "once" and one.ratio == pytest.approx(1.6, abs=0.2)
+    assert overall(signal_errors(features, predicted)) < 1.25
+    for seed in range(20):
+        assert apart_alone(*blocks_of({}, seed), 1.25) == ()
+    assert apart_alone(*blocks_of({"once": 0.5}), 1.25) == (), "that is within what the others repeat to"

@@ -13,7 +13,7 @@ from hannes_lab.chance import Chance
 from hannes_lab.diagnose import effect_sources
 from hannes_lab.fit import Fit
 from hannes_lab.hide import make_set
-from hannes_lab.intervals import intervals_of, strain, sway, wider
+from hannes_lab.intervals import intervals_of, may_vanish, strain, sway, wider
 from hannes_lab.prepare import prepare
 from hannes_lab.problem import Coordinate
 from hannes_lab.search import FAR, Search
@@ -98,7 +98,10 @@ def lap_fit(scatter: float, seed: int) -> tuple[Any, Fit]:
     one = np.sqrt(1.0 / LAPS)
     problem: Any = SimpleNamespace(
         features=SimpleNamespace(
-            size=2 * SIZE, blocks=(block, block), slices=(slice(0, SIZE), slice(SIZE, 2 * SIZE))
+            size=2 * SIZE,
+            blocks=(block, block),
+            slices=(slice(0, SIZE), slice(SIZE, 2 * SIZE)),
+            rows_of=lambda trial: np.ones(2 * SIZE, dtype=bool),
         ),
         deviations=tuple(closures[:, k] - closures[:, k].mean(axis=0) for k in range(2)),
         discrepancy=(),
@@ -163,3 +166,64 @@ def test_the_effect_that_is_the_same_thing_as_what_is_far_off_is_told() -> None:
     same = twins(search, best, far_off(best))
     assert same["friction.coulomb"] == ("coulomb_friction",)
     assert twins(search, best, []) == {}
+
+
+def test_strengths_that_act_alike_may_each_be_nought_and_not_both() -> None:
+    """A friction of one direction as a level and as a slope, where speeds hardly differ."""
+    rng = np.random.default_rng(3)
+    speed = 1.0 + 0.05 * rng.normal(size=SIZE)
+    acts = np.column_stack([np.ones(SIZE), speed])
+    coordinates = tuple(
+        Coordinate(name, 0.0, 1.0, False, -np.inf, np.inf, False, 0.1) for name in ("level", "slope")
+    )
+    for size, vanishes in ((2.0, False), (0.1, True)):
+        y = acts @ np.array([0.5 * size, 0.5 * size]) + rng.normal(size=SIZE)
+        z = np.linalg.lstsq(acts, y, rcond=None)[0]
+        left = y - acts @ z
+        found = Fit(nominal(), coordinates, z, float(left @ left), left, -acts)
+        assert all(low < 0.0 < high for low, high in intervals_of(found, limits()).values())
+        assert may_vanish(found, limits(), {}, ("level", "slope")) == vanishes
+        assert may_vanish(found, limits(), {"level": 50.0, "slope": 50.0}, ("level", "slope"))
+
+
+def test_two_repeats_of_several_conditions_know_their_scatter_together() -> None:
+    """One pair knows a variance by one degree of freedom (a factor of 12.7); five pairs of like scatter by more."""
+    wide, alone = [], []
+    for seed in range(40):
+        problem, found = paired_fit(5, 0.3, seed)
+        wide.append(sway(problem, found)["slope"])
+        problem, found = paired_fit(1, 0.3, seed)
+        alone.append(sway(problem, found)["slope"])
+    assert np.quantile(alone, 0.9) > 2.0 * np.quantile(wide, 0.9)
+    # By the curvature the standard deviation is that of noise alone; the scatter's is 0.3 sqrt(60) as large.
+    expected = np.sqrt(1.0 + 0.3**2 * SIZE)
+    assert expected < np.median(wide) < 2.0 * expected
+
+
+def paired_fit(trials: int, scatter: float, seed: int) -> tuple[Any, Fit]:
+    """A slope of 1 in recordings of two closures under noise of 1 a sample; in each closure it is another."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(trials, SIZE))
+    laps = 1.0 + scatter * rng.normal(size=(trials, 2))
+    closures = laps[..., None] * x[:, None] + rng.normal(size=(trials, 2, SIZE))
+    blocks = [SimpleNamespace(n=2, trial=k, combine=lambda c: c.mean(axis=0)) for k in range(trials)]
+    one = np.sqrt(0.5)
+
+    def rows_of(trial: int) -> Any:
+        return np.arange(trials * SIZE) // SIZE == trial
+
+    problem: Any = SimpleNamespace(
+        features=SimpleNamespace(
+            size=trials * SIZE,
+            blocks=blocks,
+            slices=[slice(k * SIZE, (k + 1) * SIZE) for k in range(trials)],
+            rows_of=rows_of,
+        ),
+        deviations=[c - c.mean(axis=0) for c in closures],
+        discrepancy=(),
+        whiten=lambda difference: difference / one,
+    )
+    along, measured = x.ravel() / one, closures.mean(axis=1).ravel() / one
+    z = np.array([along @ measured / (along @ along)])
+    residual = measured - z[0] * along
+    return problem, Fit(nominal(), (SLOPE,), z, float(residual @ residual), residual, -along[:, None])

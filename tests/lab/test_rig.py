@@ -669,7 +669,7 @@ def test_a_simpler_effect_that_does_not_join_ends_no_search(
 def cogging_may_be_nought(monkeypatch: pytest.MonkeyPatch) -> None:
     """As of data that leave its strength open."""
     monkeypatch.setattr(
-        "hannes_lab.diagnose._may_be_nought", lambda search, found, limits: found.names[-1] == "cogging"
+        "hannes_lab.diagnose._may_be_nought", lambda search, found, *_: found.names[-1] == "cogging"
     )
     monkeypatch.setattr("hannes_lab.diagnose._is_needed", lambda falls: False)
 
@@ -699,7 +699,7 @@ def test_what_is_foretold_far_worse_without_an_effect_names_it_though_its_interv
     prepared: Prepared, monkeypatch: pytest.MonkeyPatch, executor: Executor
 ) -> None:
     """Of two or three conditions one that is left out opens every interval."""
-    monkeypatch.setattr("hannes_lab.diagnose._may_be_nought", lambda search, found, limits: True)
+    monkeypatch.setattr("hannes_lab.diagnose._may_be_nought", lambda *_: True)
     found = diagnose(prepared, effect_sources(only=["coulomb_friction"]), executor=executor)
     assert found.verdict == "effects" and [e.name for e in found.effects] == ["coulomb_friction"]
     assert any(note.startswith("coulomb_friction: its 95 % intervals hold nought") for note in found.notes)
@@ -708,7 +708,7 @@ def test_what_is_foretold_far_worse_without_an_effect_names_it_though_its_interv
 def test_where_all_that_joined_may_be_nought_nothing_is_named(
     prepared: Prepared, monkeypatch: pytest.MonkeyPatch, executor: Executor
 ) -> None:
-    monkeypatch.setattr("hannes_lab.diagnose._may_be_nought", lambda search, found, limits: True)
+    monkeypatch.setattr("hannes_lab.diagnose._may_be_nought", lambda *_: True)
     monkeypatch.setattr("hannes_lab.diagnose._is_needed", lambda falls: False)
     for module in ("diagnose", "choose"):  # as of data that the model alone explains
         monkeypatch.setattr(f"hannes_lab.{module}.is_adequate", lambda *args, **how: True)

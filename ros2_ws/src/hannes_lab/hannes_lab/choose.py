@@ -12,7 +12,7 @@ from .adequacy import disbelieved, distorted, is_adequate, leads_back, led_off, 
 from .chance import Chance, chance
 from .diagnosis import Rank
 from .features import Features
-from .greedy import AS_IT_REPEATS, JUDGED, grown_straight, held_out_error, largest_error
+from .greedy import AS_IT_REPEATS, JUDGED, grown_straight, held_out_error, largest_error, stands_out
 from .search import HOPELESS, PENALTY, Candidate, Search, key_of
 
 WORTHWHILE = 0.05
@@ -75,6 +75,7 @@ class Choice:
     idle     where no effect is named: a sentence on those that fit better, but foretell no better what took no part in
              the fit
     left     a sentence on what a greedy choice leaves, where something is
+    alone    what was recorded once and is missed by more than the others repeat, where no effect is named
     other_model  that is no more than the machine repeats, but with a model that is not believed
     excluded effects that are not looked for
     taken_back effects that joined a greedy search, and are none all the same
@@ -90,6 +91,7 @@ class Choice:
     enough: bool = False
     idle: str = ""
     left: str = ""
+    alone: str = ""
     other_model: bool = False
     excluded: tuple[str, ...] = ()
     taken_back: tuple[str, ...] = ()
@@ -205,8 +207,11 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
     known = search.problem.features.repeated
     # Without repeats a guess stands for the scatter, and what it explains says nothing for an effect.
     adequate = is_adequate(search, best, choice.limits) and (known or not best.names)
-    repeats = known and (
-        last <= AS_IT_REPEATS or (not best.names and largest_error(search, best) <= AS_IT_REPEATS)
+    missed = stands_out(search, best) if known else ""
+    repeats = (
+        known
+        and not missed
+        and (last <= AS_IT_REPEATS or (not best.names and largest_error(search, best) <= AS_IT_REPEATS))
     )
     enough = repeats or (bool(best.names) and (halved(first, last) if known else last <= HALF * first))
     instead = (disbelieved(search, best) or led_off(null, best)) if best.names else ""
@@ -228,7 +233,8 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
     elif best.names and not (adequate or enough):
         above = ", as far as it is above the repeatability" if known else ""
         left = f"of the error on conditions that were left out{above}, more than half is left"
-    return replace(choice, adequate=adequate, enough=enough, left=left, other_model=other_model)
+    alone = "" if best.names or adequate or enough else missed
+    return replace(choice, adequate=adequate, enough=enough, left=left, alone=alone, other_model=other_model)
 
 
 def halved(first: float, last: float) -> bool:

@@ -43,7 +43,7 @@ from .falls import (
 from .features import data_used
 from .fit import Fit, nuisance_table
 from .greedy import OF_NOMINAL
-from .intervals import intervals_of, strain, sway, wider
+from .intervals import intervals_of, may_vanish, strain, sway, wider
 from .limits import MAX_EFFECTS, MAX_GREEDY
 from .prepare import Prepared
 from .provenance import falls_made, made_from
@@ -162,12 +162,12 @@ def diagnose(
     effects = found_effects(search, best, intervals, falls)
     unknown = verdict == "unknown"
     needed: tuple[str, ...] = ()
-    if greedy and verdict == "effects" and _may_be_nought(search, best, intervals):
+    if greedy and verdict == "effects" and _may_be_nought(search, best, limits, falls):
         few = len(prepared.features.conditions) <= FEW_CONDITIONS
         needed = (_needed_sentence(best.names[-1], falls, few),)
     clock = other_clock(search.problem, best.fit) if greedy or unknown else None
     lost = unforetold(choice) if greedy and unknown else ()
-    kind = unknown_kind(search, effects, choice, answer.bent, only, bool(lost)) if unknown else ""
+    kind = unknown_kind(search, effects, choice, answer.bent, only, bool(lost), greedy) if unknown else ""
     depends_on = residual_dependences(
         prepared.features,
         prepared.features.closures(prepared.rig, best.fit.model, best.fit.values),
@@ -329,10 +329,12 @@ def _idle_at_the_end(
     alone   what joined after it, maybe as one of a pair, has gone
     """
     needed = search.problem.features.repeated and _is_needed(falls)
-    if not needed and _may_be_nought(search, found, spans_of(search, found, limits, falls)):
+    if not needed and _may_be_nought(search, found, limits, falls):
         return "by its 95 % intervals its strength may be nought"
     before, after = falls[-2].held_out, falls[-1].held_out
-    if after > before:
+    # Of so many closures beyond the first of each condition, their scatter is known within about this.
+    more = sum(search.problem.features.closures_of.values()) - len(search.problem.features.conditions)
+    if after > before * math.sqrt(1.0 + 1.0 / max(more, 1)):
         return f"the error on held-out closures rises with it from {before:.3g} to {after:.3g} times the repeatability"
     if len(found.names) > 1 and (why := led_off(search.fit_of(found.names[:-1]), found, found.names[-1:])):
         return why
@@ -368,14 +370,11 @@ def _needed_sentence(name: str, falls: Sequence[Fall], few: bool) -> str:
     )
 
 
-def _may_be_nought(search: Search, found: Candidate, intervals: Mapping[str, tuple[float, float]]) -> bool:
-    """Whether the 95 % intervals of all strengths of the last effect hold the value at which it vanishes."""
+def _may_be_nought(search: Search, found: Candidate, limits: Chance, falls: Sequence[Fall]) -> bool:
+    """Whether all strengths of the last effect may be nought together, by 95 %."""
     name = found.names[-1]
-    return all(
-        intervals[f"{name}.{p.name}"][0] <= p.vanishing <= intervals[f"{name}.{p.name}"][1]
-        for p in search.effect(name).parameters
-        if p.vanishing is not None
-    )
+    strengths = [f"{name}.{p.name}" for p in search.effect(name).parameters if p.vanishing is not None]
+    return may_vanish(found.fit, limits, _widened(search, found, limits, falls), strengths)
 
 
 def _named_instead(choice: Choice, search: Search) -> tuple[Search, Choice]:
@@ -476,12 +475,17 @@ def _foretells(falls: Sequence[Fall]) -> bool:
 def spans_of(
     search: Search, best: Candidate, limits: Chance, falls: Sequence[Fall]
 ) -> dict[str, tuple[float, float]]:
-    """95 % intervals of a fitted set, by its closures' scatter; on a machine of others by its conditions, too."""
+    """95 % intervals of a fitted set, see _widened."""
+    return intervals_of(best.fit, limits, _widened(search, best, limits, falls))
+
+
+def _widened(search: Search, best: Candidate, limits: Chance, falls: Sequence[Fall]) -> dict[str, float]:
+    """By how much intervals are wider: by the closures' scatter; on a machine of others by its conditions, too."""
     problem = search.problem
-    reasons = [sway(problem, best.fit)]
+    reasons = [sway(problem, best.fit, limits)]
     if problem.rig.foreign or problem.discrepancy:
         reasons.append(strain(problem.features, best.fit, limits, falls[-1].left_out))
-    return intervals_of(best.fit, limits, wider(*reasons))
+    return wider(*reasons)
 
 
 def fitted_model(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from hannes_description.model import Model
 from numpy.typing import NDArray
+from scipy.special import fdtri
 
 from .features import Block, Features
 from .fit import fit
@@ -90,6 +91,36 @@ def pooled_repeatability(features: Features) -> dict[str, float]:
         power = np.array([repeatability(b) ** 2 for b in own])
         out[signal] = float(np.sqrt(seconds @ power / seconds.sum())) if own else 0.0
     return out
+
+
+def apart_alone(features: Features, closures: Sequence[Array], most: float) -> tuple[SignalError, ...]:
+    """Errors of predicted closures, one per block, of what was recorded once and is off by more than others repeat.
+
+    Against the repeatability of the signal over the conditions that were repeated: those of more than `most` times it,
+    where the mean errors of all that were recorded once are more than means of repeats scatter (F test, 5 % a signal).
+    A bias is what a root mean square of noisy samples hides.
+    """
+    pooled, signals = pooled_repeatability(features), dict.fromkeys(b.signal for b in features.blocks)
+    out: list[SignalError] = []
+    for signal in signals:
+        own = [k for k, block in enumerate(features.blocks) if block.signal == signal]
+        repeats = [b.alike.mean(axis=1) for b in (features.blocks[k] for k in own) if b.n > 1]
+        alone = [k for k in own if features.blocks[k].n == 1]
+        freedom, one = sum(m.size - 1 for m in repeats), pooled[signal]
+        if not alone or freedom == 0 or one == 0.0:
+            continue
+        left = {k: features.blocks[k].measured - closures[k] for k in alone}
+        # A mean of so many samples is known no better than by their own noise.
+        noise = one**2 / min(features.blocks[k].phase.size for k in alone)
+        scatter = max(sum(float(((m - m.mean()) ** 2).sum()) for m in repeats) / freedom, noise)
+        bias = float(np.mean([left[k].mean() ** 2 for k in alone]))
+        if bias <= fdtri(len(alone), freedom, 0.95) * scatter:
+            continue
+        for k in alone:
+            block, rmse = features.blocks[k], float(np.sqrt((left[k] ** 2).mean()))
+            if rmse > most * one:
+                out.append(SignalError(block.condition, signal, block.unit, rmse, one, rmse / one))
+    return tuple(out)
 
 
 def per_signal(features: Features, errors: Iterable[Sequence[SignalError]]) -> dict[str, float]:

@@ -166,6 +166,14 @@ class Features:
         return any(block.n > 1 for block in self.blocks)
 
     @property
+    def closures_of(self) -> dict[str, int]:
+        """Closures by condition, of the signal of which there are most."""
+        out: dict[str, int] = {}
+        for block in self.blocks:
+            out[block.condition] = max(out.get(block.condition, 0), block.n)
+        return out
+
+    @property
     def measured(self) -> Array:
         """Features of the measurement (size,)."""
         return np.concatenate([block.combine(block.measured) for block in self.blocks])
@@ -175,6 +183,13 @@ class Features:
         out = np.zeros(self.size, dtype=bool)
         for block, rows in zip(self.blocks, self.slices, strict=True):
             out[rows] = block.condition == condition
+        return out
+
+    def rows_of(self, trial: int) -> NDArray[np.bool_]:
+        """Which features belong to a trial, by its number."""
+        out = np.zeros(self.size, dtype=bool)
+        for block, rows in zip(self.blocks, self.slices, strict=True):
+            out[rows] = block.trial == trial
         return out
 
     def closures(self, rig: Rig, model: Model, values: Mapping[str, float]) -> list[Array]:

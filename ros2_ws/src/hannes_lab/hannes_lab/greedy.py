@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from .adequacy import distorted
-from .errors import condition_error, held_out_condition_errors, per_signal, signal_errors
+from .errors import apart_alone, condition_error, held_out_condition_errors, per_signal, signal_errors
+from .report_text import listed, words
 from .search import Candidate, Search
 
 JUDGED = 3
@@ -107,6 +108,23 @@ def largest_error(search: Search, candidate: Candidate) -> float:
     return max((e.ratio for e in errors if math.isfinite(e.ratio)), default=math.inf)
 
 
+def stands_out(search: Search, candidate: Candidate) -> str:
+    """Which conditions that were recorded once a fit misses by more than the others repeat; empty if it misses none.
+
+    The repeatability knows nothing of them, and an error over all conditions little.
+    """
+    problem, fit = search.problem, candidate.fit
+    features = problem.features
+    closures = features.closures(problem.rig, fit.model, fit.values)
+    return listed(
+        [
+            f"{words(e.signal)} of '{e.condition}' by {e.rmse:.3g} {e.unit} "
+            f"({e.ratio:.1f} times what others repeat to)"
+            for e in apart_alone(features, closures, AS_IT_REPEATS)
+        ]
+    )
+
+
 def grown_straight(search: Search, null: Candidate, max_effects: int, gain: float) -> Grown:
     """As `grow`, once more without an effect that ends as another form than is usual of it, beside others.
 
@@ -146,13 +164,14 @@ def grow(
     notes: list[str] = []
     names = [name for name in search.sources if name not in without]
     while len(best.names) < max_effects:
-        if not units and errors[-1] <= AS_IT_REPEATS:
+        missed = "" if units else stands_out(search, best)
+        if not (units or missed) and errors[-1] <= AS_IT_REPEATS:
             notes.append(
                 f"the held-out error of {errors[-1]:.2f} times the repeatability leaves nothing to look for (up to "
                 f"{AS_IT_REPEATS} it may be chance): the search stops here"
             )
             break
-        if not (units or best.names) and (largest := largest_error(search, best)) <= AS_IT_REPEATS:
+        if not (units or missed or best.names) and (largest := largest_error(search, best)) <= AS_IT_REPEATS:
             notes.append(
                 f"in no signal of any condition is the error of the fit more than {largest:.2f} times the "
                 f"repeatability (up to {AS_IT_REPEATS} it may be chance): there is nothing to look for. That on "

@@ -9,12 +9,12 @@ curvature, says by how much (`strain`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import chdtri, stdtrit
 
 from .chance import Chance
 from .features import Features
@@ -26,6 +26,9 @@ NORMAL = 1.96
 
 LEAST_MOVE = 0.1
 """Part of a parameter's variance by which it may move at least when a condition is left out that hardly tells it."""
+
+BORROWED = 3.0
+"""Degrees of freedom of a recording's scatter that the others' stand for, at most as many as they have."""
 
 LeftOut = Mapping[str, Mapping[str, float]]
 """Condition -> parameter -> z of a fit without that condition."""
@@ -50,20 +53,26 @@ def strain(features: Features, found: Fit, limits: Chance, left_out: LeftOut) ->
     return {name: max(1.0, float(np.sqrt(np.mean(own)))) for name, own in squares.items()}
 
 
-def sway(problem: Problem, found: Fit) -> dict[str, float]:
+def sway(problem: Problem, found: Fit, limits: Chance | None = None) -> dict[str, float]:
     """How many times farther the closures' own scatter moves each parameter than by the curvature; at least 1.
+
+    With limits the curvature is that of `intervals_of`, flatter by as much as the misfit is larger than by chance:
+    scatter makes the misfit too, and counts once.
 
     Each closure's deviation from the mean moves the estimate by what it makes of the mean; the squares of those moves
     add up to the estimate's covariance, whatever the noise's correlation along a closure and between signals (the
     sandwich estimator of Huber 1967, with closures as its clusters: Liang, Zeger 1986, Longitudinal data analysis using
     generalized linear models).  Closures of one number in one recording are taken for one lap, which has the same
     scatter in all its conditions.  That few laps know a variance badly is in it: quantiles of Student's t, with degrees
-    of freedom after Satterthwaite 1946.  What was not repeated has the noise that the problem gives it.
+    of freedom after Satterthwaite 1946.  Each recording's variance is moderated by what all recordings have, in
+    multiples of what the curvature says of it, with the weight of BORROWED degrees of freedom (Smyth 2004, Linear
+    models and empirical Bayes methods): two repeats of one move know nearly nothing of it alone.  What was not repeated
+    has the noise that the problem gives it.
     """
     inverse, size = found.covariance(), problem.features.size
     laps: dict[int, dict[int, NDArray[np.float64]]] = {}
     counts: dict[int, int] = {}
-    once = np.zeros(size, dtype=bool)
+    once: NDArray[np.bool_] = np.zeros(size, dtype=bool)
     for block, rows, deviations in zip(
         problem.features.blocks, problem.features.slices, problem.deviations, strict=True
     ):
@@ -85,22 +94,40 @@ def sway(problem: Problem, found: Fit) -> dict[str, float]:
         columns[own] = lower
         moved = found.jacobian.T @ problem.whiten(columns)
         known += moved @ moved.T
-    variance, by_freedom = np.diag(inverse @ known @ inverse).copy(), np.zeros(len(found.coordinates))
-    for trial, own_laps in laps.items():
+    freedoms = np.array([counts[trial] - 1.0 for trial in laps])[:, None]
+    parts, expected = np.zeros((2, len(laps), len(found.coordinates)))
+    for k, (trial, own_laps) in enumerate(laps.items()):
         moved = inverse @ found.jacobian.T @ problem.whiten(np.stack(list(own_laps.values()), axis=1))
-        part = (moved**2).sum(axis=1)
-        variance += part
-        by_freedom += part**2 / (counts[trial] - 1.0)
+        parts[k] = (moved**2).sum(axis=1)
+        seen = problem.features.rows_of(trial) & ~once
+        expected[k] = ((inverse @ found.jacobian[seen].T) ** 2).sum(axis=1)
+    ratio = (freedoms * parts).sum(axis=0) / np.maximum((freedoms * expected).sum(axis=0), 1e-300)
+    borrowed = np.minimum(BORROWED, freedoms.sum() - freedoms)
+    parts = (borrowed * ratio * expected + freedoms * parts) / (borrowed + freedoms)
+    variance = np.diag(inverse @ known @ inverse) + parts.sum(axis=0)
+    by_freedom = (parts**2 / (freedoms + borrowed)).sum(axis=0)
     freedom = variance**2 / np.maximum(by_freedom, np.maximum(1e-12 * variance**2, 1e-300))
     # What moves nothing has no width of either kind.
-    none = np.diag(inverse) <= 0.0
-    ratios = np.sqrt(variance / np.where(none, 1.0, np.diag(inverse))) * stdtrit(freedom, 0.975) / NORMAL
+    without = np.diag(inverse if limits is None else found.covariance(_inflation(found, limits)))
+    ratios = np.sqrt(variance / np.where(without <= 0.0, 1.0, without)) * stdtrit(freedom, 0.975) / NORMAL
     return {c.name: max(1.0, float(r)) for c, r in zip(found.coordinates, ratios, strict=True)}
 
 
 def wider(*reasons: Mapping[str, float]) -> dict[str, float]:
     """By how much intervals are wider, by name: of several reasons the largest."""
     return {name: max(r.get(name, 1.0) for r in reasons) for name in {n for r in reasons for n in r}}
+
+
+def may_vanish(found: Fit, limits: Chance, wider: Mapping[str, float], names: Sequence[str]) -> bool:
+    """Whether the 95 % region of some strengths together holds the point at which all of them vanish (z = 0).
+
+    Two that act alike may each be nought by its own interval while both cannot.
+    """
+    own = [k for k, c in enumerate(found.coordinates) if c.name in names]
+    width = np.array([wider.get(found.coordinates[k].name, 1.0) for k in own])
+    covariance = found.covariance(_inflation(found, limits))[np.ix_(own, own)] * np.outer(width, width)
+    at = found.z[own]
+    return bool(at @ np.linalg.pinv(covariance, hermitian=True) @ at <= chdtri(len(own), 0.05))
 
 
 def intervals_of(

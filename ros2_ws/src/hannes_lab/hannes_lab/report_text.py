@@ -21,7 +21,8 @@ UNKNOWN = {
 
 Where conditions do not foretell one another, an effect may explain most of them all and yet not be borne out
 (`not_foretold`); nobody can tell another machine's model from an effect; the last is where nothing was repeated, and
-nothing brings what was left out nearer.
+nothing brings what was left out nearer, or where something was recorded once and is missed by more than the rest
+repeats.
 """
 
 NO_FINDING = "These effects come nearest. They are no finding, whatever their intervals: more is missing."

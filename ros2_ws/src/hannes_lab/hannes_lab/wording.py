@@ -16,6 +16,7 @@ from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
 from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, deciding_errors, fall_sentence, left_out_errors
 from .fit import Fit, fit
+from .prepare import FEW
 from .problem import Coordinate, Problem, nuisance_coordinate
 from .report_text import UNKNOWN, listed
 from .rig import Nuisance
@@ -71,19 +72,30 @@ MANY_FAILURES = 0.05
 
 
 def unknown_kind(
-    search: Search, effects: Sequence[FoundEffect], choice: Choice, bent: str, only: Sequence[str], lost: bool
+    search: Search,
+    effects: Sequence[FoundEffect],
+    choice: Choice,
+    bent: str,
+    only: Sequence[str],
+    lost: bool,
+    greedy: bool,
 ) -> str:
-    """Which kind of "unknown" an answer is, a key of UNKNOWN; see `summary` for `bent` and `only`.
+    """Which kind of "unknown" an answer is, a key of UNKNOWN; see `summary` for `bent`, `only` and `greedy`.
 
     lost  an effect explains most of the misfit, but what was left out is foretold no better with it (`unforetold`)
+
+    What fewer than FEW repeats do not bear out may be in the catalogue all the same.
     """
     repeated = search.problem.features.repeated
-    if not (effects or bent or repeated):
+    few = greedy and max(search.problem.features.closures_of.values()) < FEW
+    if not (effects or bent or (repeated and not choice.alone)):
         return "no_repeats"
     if lost:
         return "not_foretold"
     if choice.other_model or not repeated or (bent and not effects):
         return "model_or_effect"
+    if few:
+        return "not_foretold"
     return "not_looked_for" if only else "not_in_catalogue"
 
 
@@ -145,6 +157,11 @@ def summary(
     part = f" Nearest comes {names}, which is not enough." if names else ""
     why = bent or choice.left or f"the best model's {shortfall(search, best, limits)}"
     first = f" First look at the clock: {clock.said}." if clock and clock.part >= CLOCK_LEADS else ""
+    if kind == "no_repeats" and choice.alone:
+        return (
+            f"{UNKNOWN[kind]}: what was recorded once is missed by more than the others repeat, and may be scatter or "
+            f"an effect: {choice.alone}. Record it again.{first} {fall}{far}"
+        )
     if kind == "no_repeats":
         held = len(search.problem.features.conditions) > 1
         nearer = ", and what was looked for brings nothing that was left out nearer by enough" if held else ""
