@@ -19,6 +19,7 @@ from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
 from hannes_ros.sources import Sources
+from hannes_ros.telling import LOOP, loop_of, tell
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
@@ -116,6 +117,7 @@ class MotorController(HannesNode, LifecycleNode):
                 "double_pid only."
             )
         self._pid = DoublePID.of_model(model.parameters, p.period)
+        tell(self, {"control_period": p.period, LOOP: loop_of(model)})
         self._limit = self._pid.settings.voltage_limit
         self._profile = p.profile()
         if self._profile is not None:
