@@ -46,7 +46,7 @@ def test_what_the_graph_recorded_is_compared_as_its_own(
 
 
 def told(**parameters: Any) -> dict[str, Any]:
-    return HandSimParameters(**parameters).told(NOMINAL)
+    return HandSimParameters(**{"clock": "lockstep", **parameters}).told(NOMINAL)
 
 
 def test_no_plant_is_named_of_another_hand_or_of_a_controller_of_other_gains() -> None:
@@ -54,6 +54,8 @@ def test_no_plant_is_named_of_another_hand_or_of_a_controller_of_other_gains() -
     other = {**CONTROLLER, LOOP: {**CONTROLLER[LOOP], "control.kp": 1.0}}
     assert set(description(told(), other, {})) == {"object", "sensors"}
     assert set(description(told(), {}, {})) == {"object", "sensors"}  # a bag that is played drives the motor
+    late = description(told(clock="realtime"), CONTROLLER, {})
+    assert set(late) == {"object", "sensors", "control_period"}, "messages take their time"
     own = description(told(current_noise=0.01), CONTROLLER, {})
     assert own["plant"] == "reduced" and own["control_period"] == 0.001 and own["object"] == "none"
     assert own["sensors"] == {"current_rectified": False, "current_window": 0.0, "current_noise": 0.01}

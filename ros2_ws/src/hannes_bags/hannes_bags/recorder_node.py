@@ -424,13 +424,14 @@ def description(
     """Metadata of a recording by what the two nodes of its loop tell of themselves; empty for another hand.
 
     said  the user's own entries, which stand; but an object's name does not where the hand tells its measures
-    A plant is named only where it ran in the loop of its own model.
+    A plant is named only where it ran in lock-step in the loop of its own model.
     """
     if not hand:
         return {}
     told = {"object": hand["object"], "sensors": hand["sensors"]}
     if controller.get(LOOP) == hand[LOOP]:
-        told |= {"control_period": controller["control_period"], "plant": hand["plant"]}
+        told["control_period"] = controller["control_period"]
+        told |= {name: hand[name] for name in ("plant",) if name in hand}
     measured = {"object"} if isinstance(hand["object"], Mapping) else set()
     return {name: entry for name, entry in told.items() if name not in said or name in measured}
 

@@ -88,7 +88,12 @@ class HandSimParameters:
         )
 
     def told(self, model: Model) -> dict[str, Any]:
-        """What a recording of this hand may say of itself (docs/your-own-hand.md), and the loop of its model."""
+        """What a recording of this hand may say of itself (docs/your-own-hand.md), and the loop of its model.
+
+        Only lock-step is the model to rounding, so that its plant may be named: in real time readings and commands are
+        late by what messages take.
+        """
+        exact = {"plant": model.plant} if self.clock == "lockstep" else {}
         grasp = self.grasp()
         own = grasp is not None and grasp != named_object(self.object)
         return {
@@ -98,9 +103,8 @@ class HandSimParameters:
                 "current_window": 0.0,
                 "current_noise": self.current_noise,
             },
-            "plant": model.plant,
             LOOP: loop_of(model),
-        }
+        } | exact
 
 
 class HandSim(HannesNode, Node):
