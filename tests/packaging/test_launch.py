@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -18,7 +19,10 @@ from hannes_bringup.launch_file import read_arguments, read_launch_file
 from hannes_bringup.processes import QUIET_FROM_THE_START, ProcessGroup
 from hannes_bringup.ros2_standin import find_command, launch_path, main, share_folder
 from hannes_description.errors import HannesError
+from hannes_description.joints import JOINT_NAMES
+from hannes_description.urdf import urdf_path
 from patience import PATIENCE
+from workspace import PACKAGES
 
 LAUNCH = launch_path("hannes_bringup", LAUNCH_FILE, os.environ)
 
@@ -71,6 +75,31 @@ def test_python_launch_file_is_thin_and_compiles() -> None:
     text = LAUNCH.with_name("hand.launch.py").read_text()
     compile(text, "hand.launch.py", "exec")
     assert LAUNCH_FILE in text
+
+
+def test_the_hand_is_displayed_from_what_is_installed() -> None:
+    """Not run here: there is no robot_state_publisher among the wheels. Its files are where it looks for them."""
+    path = launch_path("hannes_bringup", "display.launch.yaml", os.environ)
+    actions = yaml.safe_load(path.read_text(encoding="utf-8"))["launch"]
+    nodes = {action["node"]["exec"]: action["node"] for action in actions if "node" in action}
+    assert set(nodes) == {"robot_state_publisher", "rviz2"} and nodes["rviz2"]["if"] == "$(var rviz)"
+    assert set(nodes) <= PACKAGES["hannes_bringup"].depends("exec_depend")
+    assert {a.name: a.default for a in read_arguments(path)}["rviz"] == "false"
+    (described,) = (p for p in nodes["robot_state_publisher"]["param"] if p["name"] == "robot_description")
+    assert described["type"] == "str"
+    used = re.findall(r"\$\(find-pkg-share (\w+)\)/([\w./]+)", described["value"] + nodes["rviz2"]["args"])
+    assert [package for package, _ in used] == ["hannes_description", "hannes_bringup"]
+    for package, file in used:
+        data = PACKAGES[package].config["options.data_files"]
+        installed = {
+            f"{folder}/{Path(source).name}" for folder, files in data.items() for source in files.split()
+        }
+        assert f"share/{package}/{file}" in installed
+
+
+def test_joint_states_are_those_of_the_urdf() -> None:
+    joints = ElementTree.parse(urdf_path()).getroot().findall("joint")
+    assert {j.get("name") for j in joints if j.get("type") != "fixed"} == set(JOINT_NAMES)
 
 
 def write(folder: Path, *actions: object) -> Path:

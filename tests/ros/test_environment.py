@@ -49,6 +49,25 @@ def test_nodes_stay_on_this_machine_unless_the_user_says_otherwise(
     assert ros_environment(environment) == environment
 
 
+@pytest.mark.parametrize("range_", ["", "SUBNET", "LOCALHOST"])
+def test_who_waits_for_a_hand_says_where_only_this_machine_is_heard(
+    ros_environment: dict[str, str], range_: str
+) -> None:
+    plain = {name: value for name, value in ros_environment.items() if name not in (RANGE, PROFILES)}
+    child = subprocess.Popen(
+        [sys.executable, "-m", "hannes_bringup.cli", "run", "motor_controller"],
+        env={**plain, **({RANGE: range_} if range_ else {})},
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    try:
+        assert child.stdout is not None
+        said = next(line for line in child.stdout if "waiting for motor/state" in line)
+    finally:
+        child.terminate()
+        child.communicate()
+    assert ("ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET hears them" in said) == (range_ != "SUBNET"), said
+
+
 def test_both_profiles_find_and_forget_nodes_and_repair_losses_alike() -> None:
     local = Path(ros_environment({})[PROFILES])
     found = [

@@ -11,6 +11,7 @@ from time import monotonic, sleep
 
 import pytest
 from graph import PROGRAMS, NodeProcess, processes
+from hannes_ros.parameter_files import unread_sections
 from patience import PATIENCE
 
 NODES = [name for name in PROGRAMS if name != "composed"]
@@ -131,6 +132,39 @@ def test_help_says_which_section_of_a_file_is_read(peer, tmp_path):
         file.write_text(f"{section}: {{ros__parameters: {{object: ball}}}}\n")
         with processes(NodeProcess("hand_sim", "--ros-args", "--params-file", str(file))) as (node,):
             assert node.wait() == 2 and "is 'ball'; valid are none, soft, rigid" in node.output
+
+
+def test_a_section_of_another_namespace_is_said(peer, tmp_path):
+    """ROS passes over it in silence, and the hand would hold nothing."""
+    peer.hear_diagnostics()
+    file = tmp_path / "parameters.yaml"
+    file.write_text("hand_sim: {ros__parameters: {object: rigid, nonsense: 3}}\n")
+    with processes(NodeProcess("hand_sim", "--ros-args", "--params-file", str(file))) as (node,):
+        peer.until(lambda: bool(peer.status("hand_sim")), what="diagnostics")
+        node.end()
+        assert node.output.count("'hand_sim:' is not read") == 1, node.output
+        assert "this node is /hannes/hand_sim: name it '/hannes/hand_sim:', or '/**/hand_sim:'" in node.output
+
+
+@pytest.mark.parametrize(
+    ("content", "unread"),
+    [
+        ("hand_sim: {ros__parameters: {}}", ["hand_sim"]),
+        ("/left/hand_sim: {ros__parameters: {}}", ["/left/hand_sim"]),
+        ("left: {hand_sim: {ros__parameters: {}}}", ["left/hand_sim"]),
+        ("/left/hand_sim: {ros__parameters: {}}\n/hannes/hand_sim: {ros__parameters: {}}", []),
+        ("hannes: {hand_sim: {ros__parameters: {}}}", []),
+        ("/*/hand_sim: {ros__parameters: {}}", []),
+        ("/**/hand_sim: {ros__parameters: {}}", []),
+        ("/**: {ros__parameters: {}}\nother: {ros__parameters: {hand_sim: {a: 1}}}", []),
+        ("just a text", []),
+        ("{", []),
+    ],
+)
+def test_which_sections_are_not_for_a_node(tmp_path, content, unread):
+    file = tmp_path / "parameters.yaml"
+    file.write_text(content)
+    assert unread_sections(file, "/hannes/hand_sim") == unread
 
 
 def test_a_topic_is_renamed_in_the_old_way_too(peer):

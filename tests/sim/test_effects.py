@@ -1,6 +1,10 @@
 """The catalogue: every effect vanishes exactly, moves an output, and is the same function compiled and in Python."""
 
+import json
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -302,3 +306,44 @@ def test_a_refinement_of_an_effect_may_be_left_out_of_a_model() -> None:
     whole = load_effect("cogging").entry()
     plain = {n: p for n, p in whole.parameters.items() if "_" not in n}
     assert len(plain) == 3 and effect_of(replace(whole, parameters=plain)) is load_effect("cogging")
+
+
+def test_an_effect_of_another_package_that_is_none_is_left_out_with_one_line(tmp_path: Path) -> None:
+    """Every command reads the catalogue: one broken package would end them all."""
+    info = tmp_path / "plugin-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plugin\nVersion: 1.0\n")
+    points = {
+        "torn": "plugin_torn:Torn",
+        "number": "plugin_parts:NUMBER",
+        "odd": "plugin_parts:Odd",
+        "twin": "plugin_parts:Twin",
+        "good": "plugin_parts:Good",
+    }
+    lines = [f"{name} = {value}" for name, value in points.items()]
+    (info / "entry_points.txt").write_text("\n".join(["[hannes.effects]", *lines]))
+    (tmp_path / "plugin_torn.py").write_text("import no_such_module\n")
+    (tmp_path / "plugin_parts.py").write_text(
+        "from hannes_sim.effects.cogging import Cogging\n"
+        "NUMBER = 3\n"
+        "class Odd(Cogging):\n    name, parameters = 'odd', (3,)\n"
+        "class Twin(Cogging):\n    pass\n"
+        "class Good(Cogging):\n    name, title = 'good', 'good cogging'\n"
+    )
+    told = subprocess.run(
+        [sys.executable, "-m", "hannes_bringup.cli", "model", "effects", "--json"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    whole, said = json.loads(told.stdout)["effects"], told.stderr.splitlines()
+    names = {effect["name"] for effect in whole}
+    assert {"cogging", "good"} <= names and "odd" not in names
+    assert len(said) == 4 and all(line.startswith("warning: effect '") for line in said), told.stderr
+    assert (
+        "warning: effect 'torn' of plugin (plugin_torn:Torn) cannot be imported: ModuleNotFoundError: No module named "
+        "'no_such_module'; it is left out" in said
+    )
+    assert any(
+        "(plugin_parts:NUMBER) is not a subclass of hannes_sim.effect.Effect;" in line for line in said
+    )
+    assert any("an effect named 'cogging' exists already;" in line for line in said)

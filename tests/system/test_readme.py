@@ -116,7 +116,30 @@ def test_hidden_effect_is_found_as_printed(found: tuple[Path, str]) -> None:
 @pytest.mark.ros
 def test_graph_with_the_found_model(found: tuple[Path, str], ros_environment: dict[str, str]) -> None:
     printed = run("".join(block.text for block in marked("ros")), found[0])
-    assert "/hannes/motor/state" in printed
+    assert "/hannes/motor/state" in printed and "Overall error" in printed
+
+
+@pytest.mark.ros
+def test_what_is_recorded_as_printed_is_compared(tmp_path: Path, ros_environment: dict[str, str]) -> None:
+    """Two closures of the first speed; again where a busy machine lets the controller pause, which switches it off."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    command = re.search(r"^hannes record my_bags/(slow .*)$", text, re.MULTILINE)
+    assert command and "\nhannes run hand_sim\n" in text and "\nhannes compare my_bags\n" in text
+    hand = subprocess.Popen(
+        [sys.executable, "-m", "hannes_bringup.cli", "run", "hand_sim"], env=ros_environment
+    )
+    try:
+        for attempt in range(4):
+            try:
+                run(f"hannes record bags{attempt}/{command[1]} --closures 2", tmp_path)
+                break
+            except AssertionError as error:
+                assert attempt < 3 and 'the controller says "' in str(error)
+    finally:
+        hand.terminate()
+        hand.wait()
+    printed = run(f"hannes compare bags{attempt}", tmp_path)
+    assert "Overall error" in printed and "do not tell" not in printed
 
 
 def test_tables_are_current() -> None:

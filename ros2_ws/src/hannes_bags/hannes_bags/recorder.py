@@ -174,12 +174,14 @@ class Recorder:
             self._write(now_ns, everything=True, received=True)
             self.simulated = None
 
-    def close(self, now_ns: int) -> None:
-        """Write what is left and close the bag; losses and wrong times are kept in its metadata."""
+    def close(self, now_ns: int, more_metadata: Mapping[str, Any] | None = None) -> None:
+        """Write what is left and close the bag; losses and wrong times are kept in its metadata, and what is given."""
         self._write(now_ns, everything=True)
         lost = {topic: count for topic, count in sorted(self.losses.lost.items()) if count}
         entries = {"lost_messages": lost, MISPLACED: self.misplaced}
-        self.writer.close({name: entry for name, entry in entries.items() if entry})
+        self.writer.close(
+            {name: entry for name, entry in entries.items() if entry} | dict(more_metadata or {})
+        )
 
     def _write(self, now_ns: int, *, everything: bool, received: bool = False) -> None:
         if self.simulated is not None:

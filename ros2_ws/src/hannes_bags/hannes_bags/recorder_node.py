@@ -19,6 +19,7 @@ from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
 from hannes_ros.sources import Sources
 from hannes_ros.taking import taken
+from hannes_ros.telling import LOOP, Told
 from hannes_ros.topics import CLOCK_TOPIC, CLOCK_TYPE, DIAGNOSTICS_TOPIC, signal
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -30,6 +31,7 @@ from .writing import BagWriter, Qos
 
 _POLL_S = 0.004
 _LOOK_S = 0.05
+_ASK_S = 0.2
 _SYNC_S = 1.0
 _STOP_S = 0.5
 _LATE_S = 2.0
@@ -40,6 +42,7 @@ _HELD_MS = 170.0
 _DEPTH = 4000
 _MOST_AT_ONCE = 5000
 _LEADING = SIGNALS["encoder_position"].topic
+_DRIVING = SIGNALS["motor_voltage"].topic
 _TYPES = {
     **{signal.topic: signal.type for signal in SIGNALS.values()},
     CLOCK_TOPIC: CLOCK_TYPE,
@@ -158,8 +161,11 @@ class RecorderNode(HannesNode, Node):
         self._unwritten: HannesError | None = None
         self._stop_sync = threading.Event()
         self._sync = threading.Thread(target=self._keep_on_disk, name="sync", daemon=True)
+        self._driving = self.resolve_topic_name(_DRIVING)
+        self._told = Told(self, self._leading, self._driving)
         self._look()
         self.wall_timer(_LOOK_S, self._look)
+        self.wall_timer(_ASK_S, self._told.look)
         self.wall_timer(_POLL_S, self._listen)
         self.wall_timer(p.flush_ms / 1e3, self._flush)
         self.get_logger().info(f"recording {len(names)} topics into {p.output}")
@@ -387,9 +393,13 @@ class RecorderNode(HannesNode, Node):
             self._close(self._recorder)
         self._ears.destroy_node()
 
+    def _description(self) -> dict[str, Any]:
+        """What the simulated hand and its controller tell of themselves and the user did not say."""
+        return description(self._told.of(self._leading), self._told.of(self._driving), self._p.entries())
+
     def _close(self, recorder: Recorder) -> None:
         try:
-            recorder.close(time.time_ns())
+            recorder.close(time.time_ns(), self._description())
         except HannesError as error:
             self.fail(error)
             return
@@ -406,6 +416,24 @@ class RecorderNode(HannesNode, Node):
         if silent := [name for name in named if self.resolve_topic_name(name) not in self._begun]:
             needed = "" if self._p.topics else ", without which a recording cannot be compared with a model"
             self.get_logger().warning(f"no message came on {' and '.join(silent)}{needed}")
+
+
+def description(
+    hand: Mapping[str, Any], controller: Mapping[str, Any], said: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Metadata of a recording by what the two nodes of its loop tell of themselves; empty for another hand.
+
+    said  the user's own entries, which stand; but an object's name does not where the hand tells its measures
+    A plant is named only where it ran in lock-step in the loop of its own model.
+    """
+    if not hand:
+        return {}
+    told = {"object": hand["object"], "sensors": hand["sensors"]}
+    if controller.get(LOOP) == hand[LOOP]:
+        told["control_period"] = controller["control_period"]
+        told |= {name: hand[name] for name in ("plant",) if name in hand}
+    measured = {"object"} if isinstance(hand["object"], Mapping) else set()
+    return {name: entry for name, entry in told.items() if name not in said or name in measured}
 
 
 def _never_called(data: bytes) -> None:

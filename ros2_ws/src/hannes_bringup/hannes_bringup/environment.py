@@ -10,10 +10,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from hannes_description.errors import HannesError
+from hannes_ros.reach import LOCAL_PROFILE
 
 _RANGE, _PROFILES = "ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"
 _CONFIG = Path(__file__).parent / "config"
-_LOCAL, _ANY = _CONFIG / "fastdds_localhost.xml", _CONFIG / "fastdds.xml"
+_LOCAL, _ANY = _CONFIG / LOCAL_PROFILE, _CONFIG / "fastdds.xml"
 
 
 def _takes_profile(environment: Mapping[str, str]) -> bool:

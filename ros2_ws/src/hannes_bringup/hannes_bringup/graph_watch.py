@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from hannes_description.errors import HannesError
 from hannes_description.signals import SIGNALS
 from hannes_ros.node import DEFAULT_NAMESPACE
+from hannes_ros.reach import not_beyond
 from hannes_ros.taking import taken
 from hannes_ros.topics import DIAGNOSTICS_TOPIC
 from rclpy.context import Context
@@ -103,7 +104,7 @@ def require_free_hand(timeout: float) -> None:
             if time.monotonic() > end:
                 raise HannesError(
                     f"No motor/state is seen in ROS domain {node.context.get_domain_id()}: is hand_sim, or the motor "
-                    "board, running? (`hannes run hand_sim` starts one.)"
+                    f"board, running? (`hannes run hand_sim` starts one.){not_beyond()}"
                 )
             _spin(executor, 0.05)
         _spin(executor, QUIET)

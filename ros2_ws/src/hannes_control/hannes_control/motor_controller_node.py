@@ -17,8 +17,10 @@ from hannes_ros.lockstep import SETTLE_S, Peers, Probe, TickJoin
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
+from hannes_ros.reach import not_beyond
 from hannes_ros.run import run_node
 from hannes_ros.sources import Sources
+from hannes_ros.telling import LOOP, loop_of, tell
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
@@ -116,6 +118,7 @@ class MotorController(HannesNode, LifecycleNode):
                 "double_pid only."
             )
         self._pid = DoublePID.of_model(model.parameters, p.period)
+        tell(self, {"control_period": p.period, LOOP: loop_of(model)})
         self._limit = self._pid.settings.voltage_limit
         self._profile = p.profile()
         if self._profile is not None:
@@ -589,7 +592,7 @@ class MotorController(HannesNode, LifecycleNode):
             waiting, now = f"waiting for {', '.join(absent)}", monotonic()
             self._waits_since = self._waits_since or now
             if now - self._waits_since > _PATIENCE_S:
-                self.get_logger().warning(waiting, throttle_duration_sec=30.0)
+                self.get_logger().warning(waiting + not_beyond(), throttle_duration_sec=30.0)
             return WARN, waiting, values
         self._waits_since = None
         if self._profile is None and (silent := silence({"reference_position": self._reference_at})):

@@ -80,6 +80,7 @@ def _run(names: Sequence[str], executor: str, arguments: list[str]) -> int:
         for cls in classes:
             nodes.append(_create(cls, local[cls.node_name]))
             spinner.add_node(nodes[-1])
+            _tell_unread_sections(arguments, nodes[-1])
         stop = _StopOnSignal()
         while context.ok() and not stop.asked and not any(node.done for node in nodes):
             spinner.spin_once(_SPIN_S)
@@ -200,6 +201,18 @@ def _create(cls: Any, cli_args: list[str]) -> Node:
         return node
     except (rclpy_implementation.RCLError, NameValidationException) as error:
         raise HannesError(f"The node cannot start: {_first_line(error)}") from None
+
+
+def _tell_unread_sections(arguments: Sequence[str], node: Node) -> None:
+    from .parameter_files import files_given, unread_sections
+
+    own = node.get_fully_qualified_name()
+    for file in files_given(arguments):
+        for section in unread_sections(file, own):
+            node.get_logger().warning(
+                f"{file}: the section '{section}:' is not read, for this node is {own}: name it '{own}:', or "
+                f"'/**/{node.get_name()}:' for any namespace"
+            )
 
 
 def _executor(name: str, context: Context) -> Executor:

@@ -12,7 +12,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache, lru_cache
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
+from multiprocessing import parent_process
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
@@ -203,20 +204,39 @@ def _effects_in(module: ModuleType) -> list[EffectType]:
 
 @cache
 def catalogue() -> Mapping[str, EffectType]:
-    """All effects by name: the files of hannes_sim/effects and the entry points of other packages."""
+    """All effects by name: the files of hannes_sim/effects and the entry points of other packages.
+
+    An entry point that gives no effect is left out, with one line that says why.
+    """
     found: dict[str, EffectType] = {}
     package = importlib.import_module("hannes_sim.effects")
     for info in sorted(pkgutil.iter_modules(package.__path__), key=lambda i: i.name):
         for effect in _effects_in(importlib.import_module(f"hannes_sim.effects.{info.name}")):
             found[effect.name] = check_effect(effect, f"hannes_sim/effects/{info.name}.py")
     for point in entry_points(group=ENTRY_POINTS):
-        effect = check_effect(point.load(), f"entry point {point.value}")
-        if effect.name in found:
-            raise HannesError(
-                f"Entry point {point.value}: an effect named '{effect.name}' exists already; rename it."
-            )
+        try:
+            effect = _offered(point, found)
+        except HannesError as error:
+            # to stderr, and not by the processes that compute beside this one
+            if parent_process() is None:
+                print(f"warning: {str(error).rstrip('.')}; it is left out", file=sys.stderr, flush=True)
+            continue
         found[effect.name] = effect
     return found
+
+
+def _offered(point: EntryPoint, found: Mapping[str, EffectType]) -> EffectType:
+    """The effect of another package's entry point; HannesError where it is none, or `found` has its name."""
+    where = f"effect '{point.name}' of {point.dist.name if point.dist else 'a package'} ({point.value})"
+    try:
+        effect = point.load()
+    except Exception as error:  # whatever another package's import raises
+        raise HannesError(f"{where} cannot be imported: {reason(error)}") from error
+    if not (inspect.isclass(effect) and issubclass(effect, Effect)):
+        raise HannesError(f"{where} is not a subclass of hannes_sim.effect.Effect")
+    if call_own(where, check_effect, effect, where).name in found:
+        raise HannesError(f"{where}: an effect named '{effect.name}' exists already")
+    return effect
 
 
 @lru_cache(maxsize=256)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from time import monotonic
+from typing import Any
 
 import hannes_ros.early  # noqa: F401  (signals are safe from here on)
 import numpy as np
@@ -19,6 +20,7 @@ from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
 from hannes_ros.sources import Sources
+from hannes_ros.telling import LOOP, loop_of, tell
 from rclpy.node import Node
 
 from .factory import make_plant
@@ -85,6 +87,25 @@ class HandSimParameters:
             named, size=self.object_size or named.size, stiffness=self.object_stiffness or named.stiffness
         )
 
+    def told(self, model: Model) -> dict[str, Any]:
+        """What a recording of this hand may say of itself (docs/your-own-hand.md), and the loop of its model.
+
+        Only lock-step is the model to rounding, so that its plant may be named: in real time readings and commands are
+        late by what messages take.
+        """
+        exact = {"plant": model.plant} if self.clock == "lockstep" else {}
+        grasp = self.grasp()
+        own = grasp is not None and grasp != named_object(self.object)
+        return {
+            "object": grasp.to_dict() if own and grasp else self.object,
+            "sensors": {
+                "current_rectified": False,
+                "current_window": 0.0,
+                "current_noise": self.current_noise,
+            },
+            LOOP: loop_of(model),
+        } | exact
+
 
 class HandSim(HannesNode, Node):
     """The simulated hand: takes motor/voltage, publishes its sensors, keeps real time or waits for each command."""
@@ -98,6 +119,7 @@ class HandSim(HannesNode, Node):
         model = Model.load(p.model)
         model = model.with_plant(p.plant) if p.plant else model
         self._plant = make_plant(model, p.grasp(), dt=step_of(p.period))
+        tell(self, p.told(model))
         self._substeps = substeps_of(p.period, self._plant.dt)
         self._gate = CommandGate(model.parameters.value("supply.voltage"), p.command_timeout_ms / 1e3)
         self._torque_constant = model.parameters.value("motor.kt") * model.parameters.value("gear.ratio")
