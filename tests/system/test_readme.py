@@ -138,8 +138,7 @@ def test_what_is_recorded_as_printed_is_compared(tmp_path: Path, ros_environment
     finally:
         hand.terminate()
         hand.wait()
-    printed = run(f"hannes compare bags{attempt}", tmp_path)
-    assert "Overall error" in printed and "do not tell" not in printed
+    assert "Overall error" in run(f"hannes compare bags{attempt}", tmp_path)
 
 
 def test_tables_are_current() -> None:

@@ -206,7 +206,8 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
     search, best, left, other_model = choice.search, choice.best, "", False
     known = search.problem.features.repeated
     # Without repeats a guess stands for the scatter, and what it explains says nothing for an effect.
-    adequate = is_adequate(search, best, choice.limits) and (known or not best.names)
+    explained = is_adequate(search, best, choice.limits)
+    adequate = explained and (known or not best.names)
     missed = stands_out(search, best) if known else ""
     repeats = (
         known
@@ -225,7 +226,7 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
             "what was added leaves less than half, but takes parameters far outside their tolerances, and nothing was "
             "repeated that would tell an effect from scatter"
         )
-    elif enough and not adequate and not repeats:
+    elif enough and not explained and not repeats:
         left = (
             f"the {shortfall(search, best, choice.limits)}: something smaller is left that the "
             "catalogue does not explain"

@@ -195,8 +195,8 @@ def grow(
             why = f", for the data leave {found.left_open} open" if found.left_open else ""
             notes.append(
                 f"the next effect, {found.best.names[-1]}, would "
-                f"{'raise' if found.error > errors[-1] else 'change'} the held-out error from {errors[-1]:.2f} to "
-                f"{found.error:.2f}{OF_NOMINAL if units else ''}; its mean square must fall by "
+                f"{'raise' if found.error > errors[-1] else 'change'} the held-out error from {errors[-1]:.3g} to "
+                f"{found.error:.3g}{OF_NOMINAL if units else ''}; its mean square must fall by "
                 f"{100 * (1.0 - found.most):.0f} %{why}: the search stops here"
             )
             break

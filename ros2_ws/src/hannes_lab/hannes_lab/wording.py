@@ -335,11 +335,14 @@ def _coasting(search: Search, best: Candidate) -> list[str]:
     low = any(
         c.name == "motor.kt" and off > FAR and c.z(best.fit.values[c.name]) < 0.0 for c, off in best.fit.off
     )
+    # Its own effect may have joined under any name: what it acts by is the file's.
+    named = any("CoastingBridge" in source for source in search.sources.values())
+    whole = known.value("motor.kt") * (known.value("gear.ratio") if "gear.ratio" in known else 1.0)
     return [
         "motor.kt comes out far too low where a bridge coasts between its pulses, too: it brakes less than the model "
-        "by its back-EMF. examples/effects/coasting_bridge.py of the project is an effect for that "
-        "(--effect FILE:CoastingBridge)"
-    ] * low
+        "by its back-EMF. examples/effects/coasting_bridge.py of the project is an effect for that: set EMF in it to "
+        f"motor.kt x gear.ratio ({whole:.3g} {known['motor.kt'].unit}), and give --effect FILE:CoastingBridge"
+    ] * (low and not named)
 
 
 def unforetold(choice: Choice) -> tuple[str, ...]:
