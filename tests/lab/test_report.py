@@ -19,7 +19,7 @@ from hannes_lab.compare import MetricRow
 from hannes_lab.diagnosis import Fall, Rank
 from hannes_lab.errors import SignalError
 from hannes_lab.falls import fall_sentence
-from hannes_lab.pictures import _heading, write_picture
+from hannes_lab.pictures import MAX_CONDITIONS, _heading, most_missed, write_picture
 from hannes_lab.report import embedded_json, render_report, write_report
 from hannes_lab.report_next import next_step, runner_up
 from hannes_lab.report_text import (
@@ -867,3 +867,25 @@ def test_the_figures_of_the_heading_end_within_the_picture() -> None:
     _heading(figure, {"kind": "unknown", "label": "", "headline": "", "figures": [long] * 3}, "", 8.0)
     assert any("0.0630" in text.get_text() for text in figure.texts)
     assert max(text.get_window_extent().x1 for text in figure.texts) <= figure.bbox.x1
+
+
+def test_a_picture_shows_the_conditions_that_are_missed_most() -> None:
+    """Six conditions of two signals, of which the last is missed most, and of another signal the third."""
+    names = [f"v{k}" for k in range(6)]
+
+    def overlay(condition: str, signal: str, size: float, off: float) -> dict[str, Any]:
+        measured = [0.0, size, None, 0.0]
+        return {
+            "condition": condition,
+            "signal": signal,
+            "measured": measured,
+            "model": [off, size + off, 0.0, off],
+        }
+
+    overlays = [overlay(name, "encoder_position", 10.0, 0.01 * k) for k, name in enumerate(names)]
+    overlays += [overlay(name, "motor_current", 0.5, 0.2 if name == "v0" else 0.0) for name in names]
+    assert most_missed(overlays, names) == ["v0", "v3", "v4", "v5"]
+    assert (
+        most_missed(overlays[:3], names[:3]) == names[:3]
+        and len(most_missed(overlays, names)) == MAX_CONDITIONS
+    )

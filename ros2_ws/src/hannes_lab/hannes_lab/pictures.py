@@ -52,7 +52,7 @@ WIDTH, HEAD = 14.0, 1.15
 """Inches: the picture's width, and the height of its heading."""
 
 MAX_CONDITIONS, MAX_SIGNALS = 4, 3
-"""What one picture can hold; the report has all."""
+"""What one picture can hold: the conditions that are missed most; the report has all."""
 
 ENDINGS = (".png", ".svg", ".pdf")
 """Of files that a picture can be written to."""
@@ -104,7 +104,12 @@ def draw(
 
 def _draw(comparison: Part | None, after: Part | None, diagnosis: Part | None, title: str) -> Figure:
     overlays = list((comparison or {}).get("overlays") or [])
-    conditions = list(dict.fromkeys(str(o["condition"]) for o in overlays))[:MAX_CONDITIONS]
+    named = list(dict.fromkeys(str(o["condition"]) for o in overlays))
+    conditions = most_missed(overlays, named)
+    verdict = verdict_of(comparison, after, diagnosis)
+    if len(conditions) < len(named):
+        cut = f"{len(conditions)} of {len(named)} conditions, those that the model misses most"
+        title = f"{title or verdict['label']}  ·  {cut}"
     signals = list(dict.fromkeys(str(o["signal"]) for o in overlays))[:MAX_SIGNALS]
     across = len(conditions) == 1  # then the signals stand side by side
     lines = (1 if across else len(signals)) if overlays else 0
@@ -115,7 +120,7 @@ def _draw(comparison: Part | None, after: Part | None, diagnosis: Part | None, t
     height = HEAD + top + (0.35 if lines else 0.0) + (bottom + 0.75 if panels else 0.0)
     figure = Figure(figsize=(WIDTH, height), facecolor="white")
     FigureCanvasAgg(figure)
-    _heading(figure, verdict_of(comparison, after, diagnosis), title, height)
+    _heading(figure, verdict, title, height)
     if lines:
         grid = figure.add_gridspec(
             1,
@@ -130,6 +135,28 @@ def _draw(comparison: Part | None, after: Part | None, diagnosis: Part | None, t
         )
     _below(figure, panels, height)
     return figure
+
+
+def most_missed(overlays: Sequence[Part], named: Sequence[str]) -> list[str]:
+    """As many conditions as a picture can hold, in their order: those of which the model misses a signal most, in parts
+    of what that signal goes through in all."""
+    if len(named) <= MAX_CONDITIONS:
+        return list(named)
+    spans: dict[str, float] = {}
+    missed: dict[str, float] = dict.fromkeys(named, 0.0)
+    curves = [
+        (str(o["condition"]), str(o["signal"]), series(o, "measured"), series(o, "model")) for o in overlays
+    ]
+    for _, signal, measured, _ in curves:
+        known = [v for v in measured if v is not None]
+        spans[signal] = max(spans.get(signal, 0.0), max(known, default=0.0) - min(known, default=0.0))
+    for condition, signal, measured, model in curves:
+        left = [v for v in difference(measured, model) if v is not None]
+        if left and spans[signal] > 0.0:
+            rms = math.sqrt(sum(v * v for v in left) / len(left))
+            missed[condition] = max(missed[condition], rms / spans[signal])
+    worst = sorted(named, key=lambda name: -missed[name])[:MAX_CONDITIONS]
+    return [name for name in named if name in worst]
 
 
 @dataclass(frozen=True)
@@ -336,7 +363,9 @@ def _overlay(upper: Axes, lower: Axes, overlay: Part, after: Part | None) -> Non
             axes.spines[side].set_visible(False)
     upper.tick_params(labelbottom=False)
     upper.fill_between(_nan(t), _nan(low), _nan(high), color=INK, alpha=0.16, linewidth=0.0)
-    upper.plot(_nan(t), _nan(measured), color=INK, alpha=0.38, linewidth=3.0, label="measured ±2 sd")
+    repeated = any(h is not None and lo is not None and h > lo for h, lo in zip(high, low, strict=False))
+    label = "measured ±2 sd" if repeated else "measured"
+    upper.plot(_nan(t), _nan(measured), color=INK, alpha=0.38, linewidth=3.0, label=label)
     lower.fill_between(
         _nan(t),
         _nan(difference(low, measured)),
