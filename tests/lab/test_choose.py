@@ -187,6 +187,7 @@ def test_effects_that_only_replace_what_the_model_had_are_no_answer(
     best = made(("a",), 500.0, 5.0)
     grown = SimpleNamespace(best=best, first=(best,), errors=(4.0, 1.1), rivals=(), notes=())
     given.setattr(module, "grown_straight", lambda *args: grown)
+    given.setattr(module, "stands_out", lambda *args: "")
     given.setattr(module, "disbelieved", lambda search, c: why if reason == "disbelieved" else "")
     given.setattr(module, "led_off", lambda base, c: why if reason == "led_off" else "")
     choice = choose_greedily(search_of(NULL, best), NULL, LIMITS, 3)

@@ -93,25 +93,33 @@ class Known(dict[str, float]):
 
 
 @pytest.mark.parametrize(
-    ("fitted", "signals", "compensated", "told"),
+    ("fitted", "signals", "compensated", "source", "told"),
     [
-        (0.006, ["encoder_position"], 0.0, True),
-        (0.04, ["encoder_position"], 0.0, False),  # too high
-        (0.006, ["encoder_position", "motor_current"], 0.0, False),  # the current tells the torque constant
-        (0.006, ["encoder_position"], 1.0, False),  # the command is a current
+        (0.006, ["encoder_position"], 0.0, "cogging", True),
+        (0.04, ["encoder_position"], 0.0, "cogging", False),  # too high
+        (
+            0.006,
+            ["encoder_position", "motor_current"],
+            0.0,
+            "cogging",
+            False,
+        ),  # the current tells the torque constant
+        (0.006, ["encoder_position"], 1.0, "cogging", False),  # the command is a current
+        (0.006, ["encoder_position"], 0.0, "mine/bridge.py:CoastingBridge", False),  # it takes part already
     ],
 )
 def test_a_torque_constant_that_is_far_too_low_points_at_the_bridge(
-    fitted: float, signals: list[str], compensated: float, told: bool
+    fitted: float, signals: list[str], compensated: float, source: str, told: bool
 ) -> None:
-    kt = nuisance_coordinate(Nuisance("motor.kt", 0.0175, 0.1, True))
+    kt = nuisance_coordinate(Nuisance("motor.kt", 0.0175, 0.1, True, unit="N.m/A"))
     blocks = [SimpleNamespace(signal=signal) for signal in signals]
     problem = SimpleNamespace(rig=SimpleNamespace(foreign=True), features=SimpleNamespace(blocks=blocks))
-    parameters = Known({"motor.emf_compensated": compensated})
-    search = SimpleNamespace(problem=problem, model=SimpleNamespace(parameters=parameters))
+    parameters = Known({"motor.emf_compensated": compensated, "gear.ratio": 49.0})
+    model = SimpleNamespace(parameters=parameters)
+    search = SimpleNamespace(problem=problem, model=model, sources={"one": source})
     best = SimpleNamespace(fit=SimpleNamespace(values={"motor.kt": fitted}, off=[(kt, abs(kt.z(fitted)))]))
     said = _coasting(search, best)  # type: ignore[arg-type]
-    assert [("coasting_bridge.py" in note) for note in said] == [True] * told
+    assert [("coasting_bridge.py" in note and "(0.858 N.m/A)" in note) for note in said] == [True] * told
 
 
 def test_what_swings_is_unknown_and_its_frequency_is_said(prepared: Prepared, executor: Executor) -> None:

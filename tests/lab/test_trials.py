@@ -420,7 +420,7 @@ def test_an_operators_amplitudes_are_one_condition_whichever_came_first(order: t
 @pytest.mark.parametrize(("units", "unit"), [({}, "rad"), ({"reference": "V"}, "V")])
 def test_the_unit_of_the_reference_is_what_the_trial_says(units: dict[str, str], unit: str) -> None:
     trial = replace(make_trial(recording(half_sine(3), 250.0)), units=units)
-    assert next(s["unit"] for s in told(trial, "rad")["signals"] if s["name"] == "reference") == unit
+    assert next(s["unit"] for s in told(trial)["signals"] if s["name"] == "reference") == unit
 
 
 def test_where_an_operators_amplitudes_part_does_not_depend_on_their_order() -> None:

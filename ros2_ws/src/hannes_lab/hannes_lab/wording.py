@@ -332,17 +332,20 @@ def _coasting(search: Search, best: Candidate) -> list[str]:
     of_current = name in known and known.value(name) > 0.0
     if not problem.rig.foreign or of_current or "motor_current" in blocks:
         return []
-    low = any(
-        c.name == "motor.kt" and off > FAR and c.z(best.fit.values[c.name]) < 0.0 for c, off in best.fit.off
+    offered = any("CoastingBridge" in source for source in search.sources.values())
+    low = (
+        c
+        for c, off in best.fit.off
+        if c.name == "motor.kt" and off > FAR and c.z(best.fit.values[c.name]) < 0.0
     )
-    # Its own effect may have joined under any name: what it acts by is the file's.
-    named = any("CoastingBridge" in source for source in search.sources.values())
-    whole = known.value("motor.kt") * (known.value("gear.ratio") if "gear.ratio" in known else 1.0)
+    ratio = known.value("gear.ratio") if "gear.ratio" in known else 1.0
     return [
         "motor.kt comes out far too low where a bridge coasts between its pulses, too: it brakes less than the model "
         "by its back-EMF. examples/effects/coasting_bridge.py of the project is an effect for that: set EMF in it to "
-        f"motor.kt x gear.ratio ({whole:.3g} {known['motor.kt'].unit}), and give --effect FILE:CoastingBridge"
-    ] * (low and not named)
+        f"motor.kt x gear.ratio ({c.value(0.0) * ratio:.3g} {c.unit}), and give --effect FILE:CoastingBridge"
+        for c in low
+        if not offered
+    ]
 
 
 def unforetold(choice: Choice) -> tuple[str, ...]:
