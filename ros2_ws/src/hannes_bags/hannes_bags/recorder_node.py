@@ -426,14 +426,14 @@ def description(
     said  the user's own entries, which stand; but an object's name does not where the hand tells its measures
     A plant is named only where it ran in lock-step in the loop of its own model.
     """
-    if not hand:
-        return {}
-    told = {"object": hand["object"], "sensors": hand["sensors"]}
-    if controller.get(LOOP) == hand[LOOP]:
-        told["control_period"] = controller["control_period"]
+    told = {name: hand[name] for name in ("object", "sensors") if name in hand}
+    if LOOP in hand and controller.get(LOOP) == hand[LOOP]:
         told |= {name: hand[name] for name in ("plant",) if name in hand}
-    measured = {"object"} if isinstance(hand["object"], Mapping) else set()
-    return {name: entry for name, entry in told.items() if name not in said or name in measured}
+        told |= {name: controller[name] for name in ("control_period",) if name in controller}
+    measured = isinstance(told.get("object"), Mapping) and isinstance(said.get("object"), str)
+    return {
+        name: entry for name, entry in told.items() if name not in said or (measured and name == "object")
+    }
 
 
 def _never_called(data: bytes) -> None:

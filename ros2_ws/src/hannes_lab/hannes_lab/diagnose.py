@@ -332,9 +332,10 @@ def _idle_at_the_end(
     if not needed and _may_be_nought(search, found, limits, falls):
         return "by its 95 % intervals its strength may be nought"
     before, after = falls[-2].held_out, falls[-1].held_out
-    # Of so many closures beyond the first of each condition, their scatter is known within about this.
-    more = sum(search.problem.features.closures_of.values()) - len(search.problem.features.conditions)
-    if after > before * math.sqrt(1.0 + 1.0 / max(more, 1)):
+    features = search.problem.features
+    more = sum(features.closures_of.values()) - len(features.conditions)
+    # An error over so many closures beyond the first of each condition is known to about this part of it.
+    if after > before * (1.0 + (0.5 / more if more > 1 else 0.0)):
         return f"the error on held-out closures rises with it from {before:.3g} to {after:.3g} times the repeatability"
     if len(found.names) > 1 and (why := led_off(search.fit_of(found.names[:-1]), found, found.names[-1:])):
         return why

@@ -93,14 +93,17 @@ class Fit:
 
         inflate  factor by which the data's noise is larger than the whitening says; tolerances are what they are
         """
-        curvature = self.jacobian.T @ self.jacobian / inflate + np.diag(
-            [1.0 if c.prior else 1e-6 for c in self.coordinates]
-        )
+        told = self.jacobian.T @ self.jacobian
+        priors = np.diag([1.0 if c.prior else 1e-6 for c in self.coordinates])
         # Columns differ by many orders of magnitude: scaled to one another first, none is lost to rounding.
-        unit = np.sqrt(np.diag(curvature))
-        sizes, along = np.linalg.eigh(curvature / np.outer(unit, unit))
+        unit = np.sqrt(np.diag(told + priors))
+        scaled = np.outer(unit, unit)
+        sizes, along = np.linalg.eigh((told + priors) / scaled)
         inverse = (along / np.maximum(sizes, SINGULAR)) @ along.T
-        return np.asarray(inverse / np.outer(unit, unit), dtype=np.float64)
+        if inflate != 1.0:
+            # Of the point that was fitted with the data's weight as whitened, under noise that is larger.
+            inverse = inverse @ ((inflate * told + priors) / scaled) @ inverse
+        return np.asarray(inverse / scaled, dtype=np.float64)
 
     def sd(self, inflate: float = 1.0) -> Array:
         """Standard deviations (k,) of z, see covariance."""

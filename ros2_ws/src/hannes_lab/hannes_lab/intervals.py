@@ -106,6 +106,8 @@ def sway(problem: Problem, found: Fit, limits: Chance | None = None) -> dict[str
     parts = (borrowed * ratio * expected + freedoms * parts) / (borrowed + freedoms)
     variance = np.diag(inverse @ known @ inverse) + parts.sum(axis=0)
     by_freedom = (parts**2 / (freedoms + borrowed)).sum(axis=0)
+    # What is borrowed was found from the same closures: all of them together tell no more than they are.
+    by_freedom = np.maximum(by_freedom, parts.sum(axis=0) ** 2 / freedoms.sum())
     freedom = variance**2 / np.maximum(by_freedom, np.maximum(1e-12 * variance**2, 1e-300))
     # What moves nothing has no width of either kind.
     without = np.diag(inverse if limits is None else found.covariance(_inflation(found, limits)))
@@ -126,8 +128,11 @@ def may_vanish(found: Fit, limits: Chance, wider: Mapping[str, float], names: Se
     own = [k for k, c in enumerate(found.coordinates) if c.name in names]
     width = np.array([wider.get(found.coordinates[k].name, 1.0) for k in own])
     covariance = found.covariance(_inflation(found, limits))[np.ix_(own, own)] * np.outer(width, width)
-    at = found.z[own]
-    return bool(at @ np.linalg.pinv(covariance, hermitian=True) @ at <= chdtri(len(own), 0.05))
+    size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    at = found.z[own] / size
+    return bool(
+        at @ np.linalg.pinv(covariance / np.outer(size, size), hermitian=True) @ at <= chdtri(len(own), 0.05)
+    )
 
 
 def intervals_of(

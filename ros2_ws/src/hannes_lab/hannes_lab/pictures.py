@@ -104,13 +104,14 @@ def draw(
 
 def _draw(comparison: Part | None, after: Part | None, diagnosis: Part | None, title: str) -> Figure:
     overlays = list((comparison or {}).get("overlays") or [])
+    signals = list(dict.fromkeys(str(o["signal"]) for o in overlays))[:MAX_SIGNALS]
+    overlays = [o for o in overlays if str(o["signal"]) in signals]
     named = list(dict.fromkeys(str(o["condition"]) for o in overlays))
     conditions = most_missed(overlays, named)
     verdict = verdict_of(comparison, after, diagnosis)
     if len(conditions) < len(named):
         cut = f"{len(conditions)} of {len(named)} conditions, those that the model misses most"
         title = f"{title or verdict['label']}  ·  {cut}"
-    signals = list(dict.fromkeys(str(o["signal"]) for o in overlays))[:MAX_SIGNALS]
     across = len(conditions) == 1  # then the signals stand side by side
     lines = (1 if across else len(signals)) if overlays else 0
     # without repeats there is nothing to hold the errors against

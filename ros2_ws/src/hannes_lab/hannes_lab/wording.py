@@ -94,9 +94,9 @@ def unknown_kind(
         return "not_foretold"
     if choice.other_model or not repeated or (bent and not effects):
         return "model_or_effect"
-    if few:
-        return "not_foretold"
-    return "not_looked_for" if only else "not_in_catalogue"
+    if only:
+        return "not_looked_for"
+    return "not_foretold" if few else "not_in_catalogue"
 
 
 def summary(

@@ -70,5 +70,8 @@ class Told:
         values = futures[0].result().values
         if not values or values[0].type != ParameterType.PARAMETER_STRING:
             return {}
-        told: dict[str, Any] = json.loads(values[0].string_value)
-        return told
+        try:
+            told = json.loads(values[0].string_value)
+        except ValueError:
+            return {}  # a parameter of that name that is not this one
+        return told if isinstance(told, dict) else {}

@@ -22,6 +22,9 @@ from typing import Any
 _OURS = "HANNES_NUMBA_CACHE_DIR"
 """Environment variable that tells a child process that NUMBA_CACHE_DIR is ours, not the user's."""
 
+_OWN = "hannes-numba-own-"
+"""Name of a folder of this process and its children alone, where another's stands in the way."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -33,6 +36,8 @@ def use_source_keyed_cache() -> Path | None:
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given and given != os.environ.get(_OURS):
         return None
+    if given and Path(given).name.startswith(_OWN) and _safe(Path(given)):
+        return Path(given)  # made by the parent where there was no other place
     package = Path(__file__).parent
     # Compiled loops hold constants of MuJoCo and of the description package.
     digest = hashlib.sha256(f"{version('numba')} {version('mujoco')}".encode())
@@ -48,14 +53,21 @@ def use_source_keyed_cache() -> Path | None:
         folder = Path(tempfile.gettempdir()) / f"hannes-numba-{os.getuid()}-{digest.hexdigest()[:16]}"
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700, parents=True)
-        seen = folder.lstat()
-        if not stat.S_ISDIR(seen.st_mode) or seen.st_uid != os.getuid() or seen.st_mode & 0o022:
-            # numba runs what it reads there: never what somebody else may have put there
-            folder = Path(tempfile.mkdtemp(prefix="hannes-numba-"))
+        if not _safe(folder):
+            folder = Path(tempfile.mkdtemp(prefix=_OWN))
     os.environ["NUMBA_CACHE_DIR"] = os.environ[_OURS] = str(folder)
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = str(folder)
     return folder
+
+
+def _safe(folder: Path) -> bool:
+    """Whether nobody else can have put anything there: numba runs what it reads in its cache."""
+    try:
+        seen = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(seen.st_mode) and seen.st_uid == os.getuid() and not seen.st_mode & 0o022
 
 
 @cache
