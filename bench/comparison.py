@@ -42,7 +42,7 @@ from hannes_lab.fit import fit
 from hannes_lab.hand import HAND_ZERO
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
-from hannes_lab.problem import Problem, nuisance_coordinate
+from hannes_lab.problem import Problem, nuisance_coordinate, values_at
 from hannes_lab.rig import Nuisance
 from hannes_lab.trials import make_trial
 from hannes_sim.effect import load_effect
@@ -172,8 +172,7 @@ def sysid(prepared: Prepared) -> dict[str, Any]:
     def residual(x: Array, _: Any) -> tuple[list[Array], list[Any], list[Any]]:
         columns = []
         for point in np.reshape(x, (len(coordinates), -1)).T:  # one column per point of a Jacobian
-            values = {c.name: c.value(float(z)) for c, z in zip(coordinates, point, strict=True)}
-            columns.append(problem.residual(prepared.model, values))
+            columns.append(problem.residual(prepared.model, values_at(coordinates, point)))
         return [np.column_stack(columns) if np.ndim(x) > 1 else columns[0]], [], []
 
     # finite differences as large as the lab's own: smaller ones see the roughness of dry friction
@@ -182,7 +181,7 @@ def sysid(prepared: Prepared) -> dict[str, Any]:
             wanted, residual, optimizer="mujoco", verbose=False, max_iters=60, eps=0.5
         )
     z = np.asarray(found.as_vector(), dtype=np.float64)
-    values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
+    values = values_at(coordinates, z)
     return {"error": judged(prepared, prepared.model, values), "names": _moved(z, prepared)}
 
 

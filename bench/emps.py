@@ -28,7 +28,7 @@ from hannes_lab.errors import pooled_repeatability
 from hannes_lab.executor import Executor
 from hannes_lab.inverse import force_residual, rows
 from hannes_lab.prepare import Prepared, prepare
-from hannes_lab.problem import effect_coordinates, nuisance_coordinate, vanishing_entry
+from hannes_lab.problem import effect_coordinates, nuisance_coordinate, values_at, vanishing_entry
 from hannes_lab.rig import PlantRig, load_rig
 from hannes_sim.effect import load_effect
 from numpy.typing import NDArray
@@ -57,7 +57,7 @@ def left_out(
     low, high = np.array([c.bounds for c in coordinates]).T
 
     def values(z: Array) -> dict[str, float]:
-        return {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
+        return values_at(coordinates, z)
 
     def fitted(z: Array, used: NDArray[np.bool_]) -> Array:
         def residual(point: Array) -> Array:

@@ -121,9 +121,10 @@ def test_graph_with_the_found_model(found: tuple[Path, str], ros_environment: di
 
 @pytest.mark.ros
 def test_what_is_recorded_as_printed_is_compared(tmp_path: Path, ros_environment: dict[str, str]) -> None:
-    """Two closures of the first speed; again where a busy machine lets the controller pause, which switches it off."""
+    """Two closures of the second speed; again where a busy machine lets the controller pause, which switches it off."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    command = re.search(r"^hannes record my_bags/(slow .*)$", text, re.MULTILINE)
+    command = re.search(r"^hannes record my_bags/(fast .*)$", text, re.MULTILINE)
+    assert re.search(r"^hannes record my_bags/slow .*$", text, re.MULTILINE)
     assert command and "\nhannes run hand_sim\n" in text and "\nhannes compare my_bags\n" in text
     hand = subprocess.Popen(
         [sys.executable, "-m", "hannes_bringup.cli", "run", "hand_sim"], env=ros_environment
@@ -134,9 +135,7 @@ def test_what_is_recorded_as_printed_is_compared(tmp_path: Path, ros_environment
                 run(f"hannes record bags{attempt}/{command[1]} --closures 2", tmp_path)
                 break
             except AssertionError as error:
-                assert 'the controller says "' in str(error)
-        else:
-            pytest.skip("too busy for real time: a pause switched the motor off in each of four recordings")
+                assert attempt < 3 and 'the controller says "' in str(error)
     finally:
         hand.terminate()
         hand.wait()

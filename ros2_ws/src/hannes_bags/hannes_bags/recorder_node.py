@@ -428,8 +428,8 @@ def description(
     """
     told = {name: hand[name] for name in ("object", "sensors") if name in hand}
     if LOOP in hand and controller.get(LOOP) == hand[LOOP]:
-        told |= {name: hand[name] for name in ("plant",) if name in hand}
-        told |= {name: controller[name] for name in ("control_period",) if name in controller}
+        of_loop = (("plant", hand), ("control_period", controller))
+        told |= {name: source[name] for name, source in of_loop if name in source}
     measured = isinstance(told.get("object"), Mapping) and isinstance(said.get("object"), str)
     return {
         name: entry for name, entry in told.items() if name not in said or (measured and name == "object")

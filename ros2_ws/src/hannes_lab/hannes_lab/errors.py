@@ -100,13 +100,12 @@ def apart_alone(features: Features, closures: Sequence[Array], most: float) -> t
     where the mean errors of all that were recorded once are more than means of repeats scatter (F test, 5 % a signal).
     A bias is what a root mean square of noisy samples hides.
     """
-    pooled, signals = pooled_repeatability(features), dict.fromkeys(b.signal for b in features.blocks)
     out: list[SignalError] = []
-    for signal in signals:
+    for signal, one in pooled_repeatability(features).items():
         own = [k for k, block in enumerate(features.blocks) if block.signal == signal]
         repeats = [b.alike.mean(axis=1) for b in (features.blocks[k] for k in own) if b.n > 1]
         alone = [k for k in own if features.blocks[k].n == 1]
-        freedom, one = sum(m.size - 1 for m in repeats), pooled[signal]
+        freedom = sum(m.size - 1 for m in repeats)
         if not alone or freedom == 0 or one == 0.0:
             continue
         left = {k: features.blocks[k].measured - closures[k] for k in alone}

@@ -180,16 +180,17 @@ class Features:
 
     def rows(self, condition: str) -> NDArray[np.bool_]:
         """Which features belong to a condition."""
-        out = np.zeros(self.size, dtype=bool)
-        for block, rows in zip(self.blocks, self.slices, strict=True):
-            out[rows] = block.condition == condition
-        return out
+        return self._rows([block.condition == condition for block in self.blocks])
 
     def rows_of(self, trial: int) -> NDArray[np.bool_]:
         """Which features belong to a trial, by its number."""
+        return self._rows([block.trial == trial for block in self.blocks])
+
+    def _rows(self, belongs: Sequence[bool]) -> NDArray[np.bool_]:
+        """Which features are those of some blocks."""
         out = np.zeros(self.size, dtype=bool)
-        for block, rows in zip(self.blocks, self.slices, strict=True):
-            out[rows] = block.trial == trial
+        for own, rows in zip(belongs, self.slices, strict=True):
+            out[rows] = own
         return out
 
     def closures(self, rig: Rig, model: Model, values: Mapping[str, float]) -> list[Array]:

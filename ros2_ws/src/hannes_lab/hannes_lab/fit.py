@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from .forces import Forces, scaling
-from .problem import Coordinate, Problem
+from .problem import Coordinate, Problem, values_at
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -47,7 +47,7 @@ class Fit:
 
     @property
     def values(self) -> dict[str, float]:
-        return {c.name: c.value(float(z)) for c, z in zip(self.coordinates, self.z, strict=True)}
+        return values_at(self.coordinates, self.z)
 
     @property
     def point(self) -> dict[str, float]:
@@ -93,17 +93,29 @@ class Fit:
 
         inflate  factor by which the data's noise is larger than the whitening says; tolerances are what they are
         """
-        told = self.jacobian.T @ self.jacobian
-        priors = np.diag([1.0 if c.prior else 1e-6 for c in self.coordinates])
-        # Columns differ by many orders of magnitude: scaled to one another first, none is lost to rounding.
-        unit = np.sqrt(np.diag(told + priors))
+        unit, sizes, along = self.principal_axes()
         scaled = np.outer(unit, unit)
-        sizes, along = np.linalg.eigh((told + priors) / scaled)
         inverse = (along / np.maximum(sizes, SINGULAR)) @ along.T
         if inflate != 1.0:
             # Of the point that was fitted with the data's weight as whitened, under noise that is larger.
-            inverse = inverse @ ((inflate * told + priors) / scaled) @ inverse
+            inverse = inverse @ (self._curvature(inflate) / scaled) @ inverse
         return np.asarray(inverse / scaled, dtype=np.float64)
+
+    def principal_axes(self) -> tuple[Array, Array, Array]:
+        """Those of the curvature with the priors, each coordinate z scaled by its unit (k,): their sizes (k,), SINGULAR
+        or less where nothing is told, and the axes as columns (k, k).
+
+        Columns differ by many orders of magnitude: scaled to one another first, none is lost to rounding.
+        """
+        curvature = self._curvature()
+        unit = np.sqrt(np.diag(curvature))
+        sizes, along = np.linalg.eigh(curvature / np.outer(unit, unit))
+        return unit, sizes, along
+
+    def _curvature(self, inflate: float = 1.0) -> Array:
+        """(k, k) of data (so many times) and priors."""
+        priors = np.diag(np.maximum(prior_weights(self.coordinates), 1e-6))
+        return np.asarray(inflate * (self.jacobian.T @ self.jacobian) + priors, dtype=np.float64)
 
     def sd(self, inflate: float = 1.0) -> Array:
         """Standard deviations (k,) of z, see covariance."""
@@ -125,6 +137,13 @@ INSTEAD = (-1.0, 0.125, -0.125)
 WIDEST = 1.0
 WIDEST_LOG = 10.0
 """Longest step of a derivative: along a strength in typical values, and for the logarithm of a shape in usual steps."""
+
+
+def longest_step(c: Coordinate, z: float) -> float:
+    """Longest step along a coordinate of which a secant may still be a derivative."""
+    if c.prior:
+        return 1.0
+    return WIDEST_LOG * abs(c.inside_step(z)) if c.log else WIDEST
 
 
 def smooth_step(c: Coordinate, z: float, derivative: Array) -> float:
@@ -153,7 +172,7 @@ def finite_differences(
     """
     out = np.empty((residual.size, len(columns)))
     steps = {} if steps is None else steps
-    values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
+    values = values_at(coordinates, z)
 
     def derivative(c: Coordinate, here: float) -> tuple[Array, float]:
         whole, (low, high) = c.inside_step(here, steps.get(c.name)), c.bounds
@@ -187,9 +206,8 @@ def spread(found: Fit) -> dict[str, float]:
     """
     out = {}
     for j, (c, z, sd) in enumerate(zip(found.coordinates, found.z, found.sd(), strict=True)):
-        usual = abs(c.inside_step(float(z)))
-        most = 1.0 if c.prior else WIDEST_LOG * usual if c.log else WIDEST
-        out[c.name] = max(min(float(sd), most), smooth_step(c, float(z), found.jacobian[:, j]))
+        least = smooth_step(c, float(z), found.jacobian[:, j])
+        out[c.name] = max(min(float(sd), longest_step(c, float(z))), least)
     return out
 
 
@@ -340,8 +358,7 @@ class _Objective:
         if key not in self.kept:
             if len(self.kept) > 4:
                 self.kept.clear()
-            values = {c.name: c.value(float(v)) for c, v in zip(self.coordinates, z, strict=True)}
-            self.kept[key] = self.problem.residual(self.model, values)
+            self.kept[key] = self.problem.residual(self.model, values_at(self.coordinates, z))
         return self.kept[key]
 
     def misfit(self, r: Array) -> float:

@@ -286,14 +286,13 @@ def _what_is_missing(trials: Sequence[Trial], features: Features, rig: Rig) -> l
         if len(where) < len(trials):
             notes.append(f"{signal} is recorded only in {', '.join(where)}")
     notes += drifts(features, rig.machine)
-    most = {c: max(b.n for b in features.blocks if b.condition == c) for c in features.conditions}
-    single = [c for c, n in most.items() if n == 1]
+    single = [c for c, n in features.closures_of.items() if n == 1]
     if single:
         notes.append(
             f"one closure of {', '.join(single)}: how well it repeats is not known, and what the fit takes for scatter "
             f"is a guess, from the tolerances and the rig's `floor` ({rig.floor:g} of each signal's span)"
         )
-    few = [c for c, n in most.items() if 1 < n < FEW]
+    few = [c for c, n in features.closures_of.items() if 1 < n < FEW]
     if few:
         notes.append(
             f"fewer than five closures of {', '.join(few)}: what the fit takes for scatter is a guess from the priors "

@@ -138,6 +138,11 @@ class Coordinate:
         )
 
 
+def values_at(coordinates: Sequence[Coordinate], z: Array) -> dict[str, float]:
+    """Values by name of a point z (k,), in their units."""
+    return {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
+
+
 def nuisance_coordinate(nuisance: Nuisance) -> Coordinate:
     """z in standard deviations of the prior."""
     usual = WIDE_STEP if nuisance.wide else STEP

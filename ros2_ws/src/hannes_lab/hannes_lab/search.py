@@ -26,6 +26,7 @@ from .problem import (
     build_problem,
     effect_coordinates,
     nuisance_coordinate,
+    values_at,
     vanishing_entry,
 )
 from .rig import Nuisance
@@ -779,7 +780,7 @@ class Search:
         # Every other period: those between are no further chances.
         for shape in shapes_of(kind, tried_periods(kind, self.problem, base.fit, 2)):
             z = np.array([shape.get(c.name, c.z(here.get(c.name, c.offset))) for c in coordinates])
-            values = {c.name: c.value(float(v)) for c, v in zip(coordinates, z, strict=True)}
+            values = values_at(coordinates, z)
             r = self.problem.residual(model, values)
             columns = [coordinates.index(c) for c in strengths]
             out.append(finite_differences(self.problem, model, coordinates, z, r, columns))

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .fit import ROUGHNESS, SINGULAR, WIDEST, WIDEST_LOG, Fit, prior_weights
-from .problem import Coordinate, Problem
+from .fit import ROUGHNESS, SINGULAR, Fit, longest_step
+from .problem import Problem, values_at
 
 Array = NDArray[np.float64]
 
@@ -49,11 +49,7 @@ def over_its_spread(problem: Problem, found: Fit) -> Fit:
 
 def _along_its_axes(problem: Problem, found: Fit) -> Array:
     """The derivatives (size, k) as secants along the principal axes of the curvature."""
-    curvature = found.jacobian.T @ found.jacobian + np.diag(
-        np.maximum(prior_weights(found.coordinates), 1e-6)
-    )
-    unit = np.sqrt(np.diag(curvature))
-    sizes, along = np.linalg.eigh(curvature / np.outer(unit, unit))
+    unit, sizes, along = found.principal_axes()
     axes = along / unit[:, None]
     seen = found.jacobian @ axes
     for k, axis in enumerate(axes.T):
@@ -70,7 +66,7 @@ def _secant(problem: Problem, found: Fit, axis: Array, wanted: float, otherwise:
     A side beyond the bounds, or where the simulation diverges, is left out; where both are, it is `otherwise`.
     """
     low, high = np.array([c.bounds for c in found.coordinates]).T
-    most = np.array([_longest(c, float(z)) for c, z in zip(found.coordinates, found.z, strict=True)])
+    most = np.array([longest_step(c, float(z)) for c, z in zip(found.coordinates, found.z, strict=True)])
     size = np.maximum(np.abs(axis), 1e-300)
     step = min(wanted, float(np.min(most / size)))
     for _ in range(SHORTER):
@@ -81,8 +77,7 @@ def _secant(problem: Problem, found: Fit, axis: Array, wanted: float, otherwise:
             failures = problem.failures
             if abs(length) >= LEAST_PART * step:
                 z = found.z + length * axis
-                values = {c.name: c.value(float(v)) for c, v in zip(found.coordinates, z, strict=True)}
-                residual = problem.residual(found.model, values)
+                residual = problem.residual(found.model, values_at(found.coordinates, z))
             if residual is found.residual or problem.failures > failures:
                 length, residual = 0.0, found.residual
             there.append((length, residual))
@@ -92,10 +87,3 @@ def _secant(problem: Problem, found: Fit, axis: Array, wanted: float, otherwise:
             break
         step *= max(np.sqrt(ROUGHNESS / farthest), 0.1)
     return (last - first) / (after - before) if after > before else otherwise
-
-
-def _longest(c: Coordinate, z: float) -> float:
-    """Longest step along a coordinate of which a secant may still be a derivative."""
-    if c.prior:
-        return 1.0
-    return WIDEST_LOG * abs(c.inside_step(z)) if c.log else WIDEST
