@@ -325,12 +325,13 @@ def test_states_that_come_too_slowly_are_said(peer):
         def slow() -> bool:
             sensors.say()
             sleep(0.05)
-            return peer.status(NAME).get("message", "").startswith("motor/state comes at ")
+            status = peer.status(NAME)
+            told = status.get("message", "").startswith("motor/state comes at ")
+            # a busy machine makes the loop miss cycles, which is an error of its own for a while
+            return told and status["level"] == "1"
 
         peer.until(slow, what="a warning")
-        status = peer.status(NAME)
-        assert status["level"] == "1"
-        assert float(status["state_rate_hz"]) < 80.0
+        assert float(peer.status(NAME)["state_rate_hz"]) < 80.0
         peer.until(
             lambda: "Hz: the loop needs 100 Hz, or it oscillates" in node.output, what="the reason in the log"
         )
