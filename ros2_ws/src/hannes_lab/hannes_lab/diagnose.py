@@ -25,6 +25,7 @@ from .choose import (
     needed_gain,
     tied_sets,
 )
+from .conclusion import Conclusion
 from .delays import in_time
 from .depends import pointed_at, residual_dependences
 from .diagnosis import Diagnosis, Fall, FoundEffect, ParameterEstimate
@@ -49,20 +50,15 @@ from .prepare import Prepared
 from .provenance import falls_made, made_from
 from .screen import usable_effects
 from .search import FAR, PENALTY, Candidate, Progress, Search, silent
-from .twins import twins
 from .wording import (
     bent_sentence,
     condition_apart,
-    far_off,
     idle_sentence,
     law_sentence,
     lead,
     led_back_sentence,
     notes,
     other_clock,
-    summary,
-    unforetold,
-    unknown_kind,
     worse_fitted,
 )
 
@@ -123,77 +119,28 @@ def diagnose(
              looking for the smallest set that explains all; None: where no model has the machine's form
              (Rig.foreign), and there are two conditions or more
     """
-    if greedy is None:
-        greedy = prepared.rig.foreign and len(prepared.features.conditions) > 1
-    if greedy:
-        must_be_held_out(prepared.features)
-    if max_effects is None:
-        max_effects = MAX_GREEDY if greedy else MAX_EFFECTS
-    if not sources:
-        raise HannesError(
-            "There is no effect to look for: those that were named are in the model already, or none was named."
-        )
-    whole = set(catalogue()) <= {*sources, *(effect.name for effect in prepared.model.effects)}
-    only = () if whole else tuple(sources)
-    usable = usable_effects(prepared, sources)
-    sources = usable.sources
-    prepared = replace(prepared, notes=(*prepared.notes, *usable.notes))
-    search = Search(
-        prepared.problem,
-        prepared.model,
-        prepared.nuisances,
-        sources,
-        executor=executor or Executor(jobs),
-        progress=progress,
-    )
+    greedy, max_effects = _how(prepared, greedy, max_effects)
+    prepared, search, only = _opened(prepared, sources, executor or Executor(jobs), progress)
     given = prepared
     prepared, search = in_time(given, search)
     moved = None if prepared is given else prepared
     answer = _answer(prepared, search, max_effects, greedy)
-    choice, falls, search = answer.choice, answer.falls, answer.choice.search
-    best, limits = choice.best, choice.limits
+    told, intervals = _concluded(answer, only, greedy)
+    choice, best, falls, unknown = answer.choice, told.best, told.falls, told.verdict == "unknown"
+    search, limits = choice.search, choice.limits
     prepared = replace(prepared, problem=search.problem)
-    if not answer.holds:
-        best, falls = worth_showing(search, best, falls)
-    verdict = "unknown" if not answer.holds else "effects" if best.names else "nothing"
-    tied = tied_sets(choice) if verdict == "effects" else ()
-    best = search.with_spread(best)
-    intervals = spans_of(search, best, limits, falls)
-    effects = found_effects(search, best, intervals, falls)
-    unknown = verdict == "unknown"
-    needed: tuple[str, ...] = ()
-    if greedy and verdict == "effects" and _may_be_nought(search, best, limits, falls):
-        few = len(prepared.features.conditions) <= FEW_CONDITIONS
-        needed = (_needed_sentence(best.names[-1], falls, few),)
-    clock = other_clock(search.problem, best.fit) if greedy or unknown else None
-    lost = unforetold(choice) if greedy and unknown else ()
-    kind = unknown_kind(search, effects, choice, answer.bent, only, bool(lost), greedy) if unknown else ""
     depends_on = residual_dependences(
         prepared.features,
         prepared.features.closures(prepared.rig, best.fit.model, best.fit.values),
         prepared.rig.drive_signals,
     )
     pointer = pointed_at(depends_on, prepared.rig.drive_signals) if unknown else ""
+    tied = told.tied
     experiments = separating_experiments(prepared, [search.fit_of(n) for n in tied]) if len(tied) > 1 else ()
     return Diagnosis(
-        verdict=verdict,
-        summary=summary(
-            search,
-            verdict,
-            kind=kind,
-            effects=effects,
-            tied=tied,
-            falls=falls,
-            limits=limits,
-            choice=choice,
-            best=best,
-            bent=answer.bent,
-            only=only,
-            clock=clock,
-            greedy=greedy,
-            twins=twins(search, best, far_off(best)),
-        ),
-        effects=effects,
+        verdict=told.verdict,
+        summary=told.summary,
+        effects=told.effects,
         tied=tied,
         experiments=experiments,
         falls=falls,
@@ -209,13 +156,13 @@ def diagnose(
         nuisances=nuisance_table(best.fit, intervals),
         notes=(
             *((pointer,) if pointer else ()),
-            *lost,
-            *needed,
+            *told.lost,
+            *(_needed_although(told) if greedy else ()),
             *prepared.notes,
             *choice.notes,
             *((choice.left,) if choice.left and not unknown else ()),
-            *notes(search, best, verdict, effects, experiments, greedy, clock),
-            *(lead(choice, falls) if verdict == "effects" else ()),
+            *notes(search, best, told.verdict, told.effects, experiments, greedy, told.clock),
+            *(lead(choice, falls) if told.verdict == "effects" else ()),
             *(() if unknown else condition_apart(falls)),
             *worse_fitted(falls),
         ),
@@ -225,10 +172,79 @@ def diagnose(
         model=fitted_model(prepared, search, best, intervals, falls),
         values=best.fit.values,
         nominal=answer.null.fit.values,
-        unknown_kind=kind,
+        unknown_kind=told.kind,
         greedy=greedy,
         moved=moved,
     )
+
+
+def _how(prepared: Prepared, greedy: bool | None, max_effects: int | None) -> tuple[bool, int]:
+    """Whether effects are added one after another, and how many at most; see `diagnose`."""
+    if greedy is None:
+        greedy = prepared.rig.foreign and len(prepared.features.conditions) > 1
+    if greedy:
+        must_be_held_out(prepared.features)
+    if max_effects is None:
+        max_effects = MAX_GREEDY if greedy else MAX_EFFECTS
+    return greedy, max_effects
+
+
+def _opened(
+    prepared: Prepared, sources: Mapping[str, str], executor: Executor, progress: Progress
+) -> tuple[Prepared, Search, tuple[str, ...]]:
+    """The search among the effects that can be tried, and their names where they are not the whole catalogue."""
+    if not sources:
+        raise HannesError(
+            "There is no effect to look for: those that were named are in the model already, or none was named."
+        )
+    whole = set(catalogue()) <= {*sources, *(effect.name for effect in prepared.model.effects)}
+    only = () if whole else tuple(sources)
+    usable = usable_effects(prepared, sources)
+    prepared = replace(prepared, notes=(*prepared.notes, *usable.notes))
+    search = Search(
+        prepared.problem,
+        prepared.model,
+        prepared.nuisances,
+        usable.sources,
+        executor=executor,
+        progress=progress,
+    )
+    return prepared, search, only
+
+
+def _concluded(
+    answer: _Answer, only: tuple[str, ...], greedy: bool
+) -> tuple[Conclusion, dict[str, tuple[float, float]]]:
+    """The verdict of an answer, its set as it is shown, and the 95 % intervals."""
+    choice, falls, search = answer.choice, answer.falls, answer.choice.search
+    best, limits = choice.best, choice.limits
+    if not answer.holds:
+        best, falls = worth_showing(search, best, falls)
+    verdict = "unknown" if not answer.holds else "effects" if best.names else "nothing"
+    tied = tied_sets(choice) if verdict == "effects" else ()
+    best = search.with_spread(best)
+    intervals = spans_of(search, best, limits, falls)
+    told = Conclusion(
+        choice,
+        best,
+        verdict,
+        effects=found_effects(search, best, intervals, falls),
+        tied=tied,
+        falls=falls,
+        bent=answer.bent,
+        only=only,
+        greedy=greedy,
+        clock=other_clock(search.problem, best.fit) if greedy or verdict == "unknown" else None,
+    )
+    return told, intervals
+
+
+def _needed_although(told: Conclusion) -> tuple[str, ...]:
+    """A sentence on an effect that is named though it may be nought by its intervals."""
+    if told.verdict != "effects" or not _may_be_nought(told.search, told.best, told.limits, told.falls):
+        return ()
+    few = len(told.search.problem.features.conditions) <= FEW_CONDITIONS
+    return (_needed_sentence(told.best.names[-1], told.falls, few),)
 
 
 @dataclass(frozen=True)

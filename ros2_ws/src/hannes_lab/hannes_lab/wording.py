@@ -1,24 +1,21 @@
-"""The answer in words: its summary, and the notes beside it."""
+"""What is said beside an answer: notes, and the sentences of which its summary (conclusion.py) is made."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from .adequacy import disbelieved, shortfall, waves_of
-from .chance import Chance
+from .adequacy import disbelieved, waves_of
 from .choose import Choice, can_be_held_out, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect
 from .experiments import VISIBLE, Experiment
-from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, deciding_errors, fall_sentence, left_out_errors
+from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, deciding_errors, left_out_errors
 from .fit import Fit, fit
-from .prepare import FEW
 from .problem import Coordinate, Problem, nuisance_coordinate
-from .report_text import UNKNOWN, listed
 from .rig import Nuisance
 from .search import FAR, PENALTY, Candidate, Search, key_of
 from .trials import Trial, curves_of
@@ -30,9 +27,6 @@ ANY_DIFFERENCE = (
 
 CLOCK_PART = 0.25
 """Part of the misfit that another clock of the reference must remove to be worth a note."""
-
-CLOCK_LEADS = 0.5
-"""Part from which it is said in the summary: what is left after that may need no effect."""
 
 CLOCK_STEPS = 6
 """Length of the fit that tells it."""
@@ -58,126 +52,17 @@ SHOWN_WAVES = 2.0
 ONE_WAY = 0.8
 """Part of its range that a machine is away at the end of a condition from where it began, if that goes one way."""
 
-NAMED = 4
-"""Effects that a sentence names; of more, it says how many."""
-
 MOST = 0.75
 """Part of the excess misfit that an effect explains alone from which it is worth a note where it does not join."""
 
 NOUGHT = 1e-9
 """What is less is said as 0: no parameter of a machine is that small in SI."""
 
+NAMED = 4
+"""Effects that a sentence names; of more, it says how many."""
+
 MANY_FAILURES = 0.05
 """Part of the simulations that did not stay finite from which on their parameters are worth a look."""
-
-
-def unknown_kind(
-    search: Search,
-    effects: Sequence[FoundEffect],
-    choice: Choice,
-    bent: str,
-    only: Sequence[str],
-    lost: bool,
-    greedy: bool,
-) -> str:
-    """Which kind of "unknown" an answer is, a key of UNKNOWN; see `summary` for `bent`, `only` and `greedy`.
-
-    lost  an effect explains most of the misfit, but what was left out is foretold no better with it (`unforetold`)
-
-    What fewer than FEW repeats do not bear out may be in the catalogue all the same.
-    """
-    repeated = search.problem.features.repeated
-    few = greedy and max(search.problem.features.closures_of.values()) < FEW
-    if not (effects or bent or (repeated and not choice.alone)):
-        return "no_repeats"
-    if lost:
-        return "not_foretold"
-    if choice.other_model or not repeated or (bent and not effects):
-        return "model_or_effect"
-    if only:
-        return "not_looked_for"
-    return "not_foretold" if few else "not_in_catalogue"
-
-
-def summary(
-    search: Search,
-    verdict: str,
-    *,
-    kind: str,
-    effects: Sequence[FoundEffect],
-    tied: Sequence[Sequence[str]],
-    falls: Sequence[Fall],
-    limits: Chance,
-    choice: Choice,
-    best: Candidate,
-    bent: str,
-    only: Sequence[str],
-    clock: Clock | None,
-    greedy: bool,
-    twins: Mapping[str, Sequence[str]],
-) -> str:
-    """The verdict in a sentence or two: what is missing, how the error falls, and what to be careful with.
-
-    kind  of the verdict "unknown" (see unknown_kind)
-    bent  why the set that chance explains is no answer, if it is none
-    twins effects that do the same as a parameter that is far off, by its name
-    clock what another clock of the reference would remove
-    only  the effects that were looked for, where those are not the whole catalogue
-    """
-    fall = fall_sentence(falls, greedy)
-    far = _moved_far(best, twins)
-    if verdict == "nothing":
-        explained = (
-            f"the model's misfit {best.fit.cost:.0f} is {'below' if best.fit.cost < limits.misfit else 'little above'} "
-            f"what chance reaches ({limits.misfit:.0f})"
-            if choice.adequate
-            else "the model is as close to the recordings as they repeat"
-        )
-        other = choice.idle and f", though {choice.idle}"
-        if not other and choice.adequate and choice.ranking:
-            some = f"none of {_listed(only)}" if only else "no effect of the catalogue"
-            other = f", and {some} " + (
-                "brings the error on conditions that were left out down by enough"
-                if greedy
-                else "gains more than chance would"
-            )
-        if not search.problem.features.repeated:
-            other += "; but nothing was repeated, and a guess stands for the scatter"
-        nearest = "" if choice.idle or greedy else nearest_sentence(choice)
-        return f"Nothing is missing: with its own parameters fitted, {explained}{other}. {fall}{far and far + nearest}"
-    names = " and ".join(e.title for e in effects)
-    if verdict == "effects":
-        tie = ""
-        if len(tied) > 1:
-            others = "; ".join(" + ".join(names_) for names_ in tied[1:])
-            tie = f" With these data it ties with: {others}."
-        return f"Missing: {names}. {fall}{tie}{far}"
-    if bent and not names:
-        return f"{UNKNOWN[kind]}: {bent}. {fall}{nearest_sentence(choice)}"
-    part = f" Nearest comes {names}, which is not enough." if names else ""
-    why = bent or choice.left or f"the best model's {shortfall(search, best, limits)}"
-    first = f" First look at the clock: {clock.said}." if clock and clock.part >= CLOCK_LEADS else ""
-    if kind == "no_repeats" and choice.alone:
-        return (
-            f"{UNKNOWN[kind]}: what was recorded once is missed by more than the others repeat, and may be scatter or "
-            f"an effect: {choice.alone}. Record it again.{first} {fall}{far}"
-        )
-    if kind == "no_repeats":
-        held = len(search.problem.features.conditions) > 1
-        nearer = ", and what was looked for brings nothing that was left out nearer by enough" if held else ""
-        return (
-            f"{UNKNOWN[kind]}, for nothing was repeated: {why}, but a guess stands for the "
-            f"scatter{nearer}.{first} {fall}{far}"
-        )
-    looked_for = f" ({_listed(only)})" if kind == "not_looked_for" else ""
-    return (
-        f"{UNKNOWN[kind]}{looked_for}: {why}.{first}{part} {fall}{'' if choice.other_model or bent else far}"
-    )
-
-
-def _listed(names: Sequence[str]) -> str:
-    """A few names, or how many there are."""
-    return ", ".join(names) if len(names) <= NAMED else f"{len(names)} effects"
 
 
 def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
@@ -202,7 +87,7 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
     if not known or any(halved(a, b) for a, b in known):
         return ""
     return (
-        f"{' and '.join(best.names)} would bring the misfit within chance only with {_far_values(best)}, far outside "
+        f"{' and '.join(best.names)} would bring the misfit within chance only with {far_values(best)}, far outside "
         "the tolerance, and still leave more than half of the error on held-out closures"
     )
 
@@ -399,7 +284,7 @@ def law_sentence(effect: str, how: str, with_it: float, without: float) -> str:
 def led_back_sentence(whole: Candidate, part: Candidate) -> str:
     """Why effects are named without which what took no part in the fit is foretold as well."""
     return (
-        f"without {_further(whole, part)} the model foretells as well, but only with {_far_values(part)}, far outside "
+        f"without {_further(whole, part)} the model foretells as well, but only with {far_values(part)}, far outside "
         "the tolerance"
     )
 
@@ -463,27 +348,12 @@ def lead(choice: Choice, falls: Sequence[Fall]) -> tuple[str, ...]:
     )
 
 
-def _moved_far(best: Candidate, twins: Mapping[str, Sequence[str]]) -> str:
-    """A sentence on nominal parameters far from their values: this machine's, or an effect of the same form."""
-    far = _far_values(best)
-    if not far:
-        return ""
-    same = "".join(
-        f" With these data {listed(names, 'or')} would do the same as {parameter}."
-        for parameter, names in twins.items()
-    )
-    return (
-        f" But it takes {far}, far outside the tolerance: is the nominal model that of this machine, or is "
-        f"there an effect of the same form?{same}"
-    )
-
-
 def far_off(best: Candidate) -> list[Coordinate]:
     """The nominal parameters that are far from their values."""
     return [c for c, off in best.fit.off if off > FAR]
 
 
-def _far_values(best: Candidate) -> str:
+def far_values(best: Candidate) -> str:
     """The nominal parameters that are far from their values, with what they would be."""
     return _said_far(best.fit, far_off(best))
 
