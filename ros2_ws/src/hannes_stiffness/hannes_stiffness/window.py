@@ -118,14 +118,16 @@ def _logarithm(x: float, scale: float) -> float:
 
 
 @njit(cache=True)
-def window_features(s: Any, t: float, i: float, r: float, q: float, mask: float, out: Any) -> bool:
-    """Take one sample into the state s and write its features (len(WINDOW_NAMES),) to out.
+def _place(back: int, s: Any) -> int:
+    """Where in the state the sample before so many others stands: time, current, reference, encoder."""
+    return int(_RING + 4 * ((int(s[_COUNT]) - 1 - back) % SAMPLES))
 
-    t s; i A; r, q rad; mask s. True where the start of a closure makes the sample void.
-    """
-    n = int(s[_COUNT])
-    if n > 0:
-        last = _RING + 4 * ((n - 1) % SAMPLES)
+
+@njit(cache=True)
+def _take(s: Any, t: float, i: float, r: float, q: float) -> None:
+    """One more sample; where the reference sets off again, a closure begins."""
+    if s[_COUNT] > 0.0:
+        last = _place(0, s)
         rate = (r - s[last + 2]) / (t - s[last])
         if rate > _RISES and s[_RISING] == 0.0:
             s[_RISING] = 1.0
@@ -134,17 +136,19 @@ def window_features(s: Any, t: float, i: float, r: float, q: float, mask: float,
         elif rate <= _RESTS:
             s[_RISING] = 0.0
     s[_PEAK] = max(s[_PEAK], r)
-    at = _RING + 4 * (n % SAMPLES)
+    s[_COUNT] += 1.0
+    at = _place(0, s)
     s[at], s[at + 1], s[at + 2], s[at + 3] = t, i, r, q
-    n += 1
-    s[_COUNT] = n
-    m = min(n, SAMPLES)
 
-    # The window: means, least-squares slopes over time and over the encoder, range
+
+@njit(cache=True)
+def _over_window(s: Any, m: int) -> tuple[float, float, float, float, float, float]:
+    """Of the newest m samples: mean and range of the current, least-squares slopes of current, reference and encoder
+    over time, and of current over encoder."""
     mt = mi = mr = mq = 0.0
     low, high = 1e9, -1e9
     for k in range(m):
-        a = _RING + 4 * ((n - 1 - k) % SAMPLES)
+        a = _place(k, s)
         mt += s[a]
         mi += s[a + 1]
         mr += s[a + 2]
@@ -153,7 +157,7 @@ def window_features(s: Any, t: float, i: float, r: float, q: float, mask: float,
     mt, mi, mr, mq = mt / m, mi / m, mr / m, mq / m
     tt = ti = tr = tq = qq = qi = 0.0
     for k in range(m):
-        a = _RING + 4 * ((n - 1 - k) % SAMPLES)
+        a = _place(k, s)
         dt, di, dr, dq = s[a] - mt, s[a + 1] - mi, s[a + 2] - mr, s[a + 3] - mq
         tt += dt * dt
         ti += dt * di
@@ -161,111 +165,191 @@ def window_features(s: Any, t: float, i: float, r: float, q: float, mask: float,
         tq += dt * dq
         qq += dq * dq
         qi += dq * di
-    slope = velocity = reference_velocity = step = step_q = 0.0
-    if m > 1:
-        slope, reference_velocity, velocity = ti / tt, tr / tt, tq / tt
-        b = _RING + 4 * ((n - 2) % SAMPLES)
-        step = (i - s[b + 1]) / (t - s[b])
-        # A hundredth of a radian is thirty counts: below it the encoder stands, and the ratio says nothing more.
-        step_q = (i - s[b + 1]) / max(abs(q - s[b + 3]), 0.01)
     ratio = qi / max(qq, m * 1e-4)
+    if m < 2:
+        return mi, high - low, 0.0, 0.0, 0.0, ratio
+    return mi, high - low, ti / tt, tr / tt, tq / tt, ratio
 
-    # Velocity and acceleration by a parabola through the newest samples, in the middle of the last step, which is what
-    # an averaged current belongs to.
-    speed, acceleration = velocity, 0.0
-    if m >= 4:
-        used = min(m, 5)
-        s1 = s2 = s3 = s4 = y0 = y1 = y2 = 0.0
-        for k in range(used):
-            a = _RING + 4 * ((n - 1 - k) % SAMPLES)
-            x, y = s[a] - t, s[a + 3] - q
-            s1 += x
-            s2 += x * x
-            s3 += x * x * x
-            s4 += x * x * x * x
-            y0 += y
-            y1 += x * y
-            y2 += x * x * y
-        c2, c3, c4 = s2 - s1 * s1 / used, s3 - s1 * s2 / used, s4 - s2 * s2 / used
-        d1, d2 = y1 - s1 * y0 / used, y2 - s2 * y0 / used
-        determinant = c2 * c4 - c3 * c3
-        if determinant > 1e-18:
-            curve = (c2 * d2 - c3 * d1) / determinant
-            back = 0.5 * (s[_RING + 4 * ((n - 2) % SAMPLES)] - t)
-            acceleration = 2.0 * curve
-            speed = (c4 * d1 - c3 * d2) / determinant + acceleration * back
-    load = abs(i) - INERTIA * acceleration - VISCOUS * speed - SPRING * q
 
-    blind = t - s[_ONSET] < mask
-    if not blind:
-        first = s[_SEEN] == 0.0
-        s[_SEEN] = 1.0
-        if first:
-            s[_FREE] = load
-        above = load - s[_FREE]
-        if first or (above < LIFT and (s[_LOADED] == 0.0 or velocity > _CLOSES)):
-            if velocity > _CLOSES:
-                s[_FREE] += FORGET * above
-            s[_LOADED] = 0.0
-            s[_Q0], s[_I0], s[_T0], s[_V0], s[_LOAD0] = q, abs(i), t, velocity, load
-            s[_STEEP] = s[_STEEP_Q] = s[_RISE] = s[_TRAVEL] = s[_LOAD_RISE] = 0.0
-            s[_N], s[_SQ], s[_SI], s[_SQQ], s[_SQI] = 1.0, 0.0, 0.0, 0.0, 0.0
-            s[_SZZ], s[_SQZ], s[_SZI] = 0.0, 0.0, 0.0
-            if velocity > _CLOSES:
-                s[_FN] += 1.0
-                s[_FQ] += q
-                s[_FI] += load
-                s[_FQQ] += q * q
-                s[_FQI] += q * load
-        elif q - s[_Q0] >= s[_TRAVEL] or load - s[_LOAD0] > s[_LOAD_RISE]:
-            s[_LOADED] = 1.0
-            x, y = q - s[_Q0], load - s[_LOAD0]
-            s[_TRAVEL], s[_LOAD_RISE] = max(s[_TRAVEL], x), max(s[_LOAD_RISE], y)
-            s[_RISE] = max(s[_RISE], abs(i) - s[_I0])
-            s[_STEEP] = max(s[_STEEP], max(slope, step))
-            s[_STEEP_Q] = max(s[_STEEP_Q], ratio)
-            s[_N] += 1.0
-            s[_SQ] += x
-            s[_SI] += y
-            s[_SQQ] += x * x
-            s[_SQI] += x * y
-            s[_SZZ] += speed * speed
-            s[_SQZ] += x * speed
-            s[_SZI] += speed * y
+@njit(cache=True)
+def _last_step(s: Any, m: int) -> tuple[float, float]:
+    """Change of the current over the last step, per time and per encoder."""
+    if m < 2:
+        return 0.0, 0.0
+    a, b = _place(0, s), _place(1, s)
+    change = s[a + 1] - s[b + 1]
+    # A hundredth of a radian is thirty counts: below it the encoder stands, and the ratio says nothing more.
+    return change / (s[a] - s[b]), change / max(abs(s[a + 3] - s[b + 3]), 0.01)
+
+
+@njit(cache=True)
+def _motion(s: Any, m: int, velocity: float) -> tuple[float, float]:
+    """Velocity and acceleration by a parabola through the newest samples, in the middle of the last step, which is what
+    an averaged current belongs to; that velocity, and none, of too few samples."""
+    if m < 4:
+        return velocity, 0.0
+    used, a0 = min(m, 5), _place(0, s)
+    s1 = s2 = s3 = s4 = y0 = y1 = y2 = 0.0
+    for k in range(used):
+        a = _place(k, s)
+        x, y = s[a] - s[a0], s[a + 3] - s[a0 + 3]
+        s1 += x
+        s2 += x * x
+        s3 += x * x * x
+        s4 += x * x * x * x
+        y0 += y
+        y1 += x * y
+        y2 += x * x * y
+    c2, c3, c4 = s2 - s1 * s1 / used, s3 - s1 * s2 / used, s4 - s2 * s2 / used
+    d1, d2 = y1 - s1 * y0 / used, y2 - s2 * y0 / used
+    determinant = c2 * c4 - c3 * c3
+    if determinant <= 1e-18:
+        return velocity, 0.0
+    acceleration = 2.0 * ((c2 * d2 - c3 * d1) / determinant)
+    back = 0.5 * (s[_place(1, s)] - s[a0])
+    return (c4 * d1 - c3 * d2) / determinant + acceleration * back, acceleration
+
+
+@njit(cache=True)
+def _follow(
+    s: Any,
+    t: float,
+    i: float,
+    q: float,
+    load: float,
+    velocity: float,
+    speed: float,
+    steepest: float,
+    ratio: float,
+) -> None:
+    """Take a sample of a closure into what is kept of its free way, its contact and the way from there."""
+    first = s[_SEEN] == 0.0
+    s[_SEEN] = 1.0
+    if first:
+        s[_FREE] = load
+    above = load - s[_FREE]
+    if first or (above < LIFT and (s[_LOADED] == 0.0 or velocity > _CLOSES)):
+        if velocity > _CLOSES:
+            s[_FREE] += FORGET * above
+        s[_LOADED] = 0.0
+        s[_Q0], s[_I0], s[_T0], s[_V0], s[_LOAD0] = q, abs(i), t, velocity, load
+        s[_STEEP] = s[_STEEP_Q] = s[_RISE] = s[_TRAVEL] = s[_LOAD_RISE] = 0.0
+        s[_N], s[_SQ], s[_SI], s[_SQQ], s[_SQI] = 1.0, 0.0, 0.0, 0.0, 0.0
+        s[_SZZ], s[_SQZ], s[_SZI] = 0.0, 0.0, 0.0
+        if velocity > _CLOSES:
+            s[_FN] += 1.0
+            s[_FQ] += q
+            s[_FI] += load
+            s[_FQQ] += q * q
+            s[_FQI] += q * load
+    elif q - s[_Q0] >= s[_TRAVEL] or load - s[_LOAD0] > s[_LOAD_RISE]:
+        s[_LOADED] = 1.0
+        x, y = q - s[_Q0], load - s[_LOAD0]
+        s[_TRAVEL], s[_LOAD_RISE] = max(s[_TRAVEL], x), max(s[_LOAD_RISE], y)
+        s[_RISE] = max(s[_RISE], abs(i) - s[_I0])
+        s[_STEEP] = max(s[_STEEP], steepest)
+        s[_STEEP_Q] = max(s[_STEEP_Q], ratio)
+        s[_N] += 1.0
+        s[_SQ] += x
+        s[_SI] += y
+        s[_SQQ] += x * x
+        s[_SQI] += x * y
+        s[_SZZ] += speed * speed
+        s[_SQZ] += x * speed
+        s[_SZI] += speed * y
+
+
+@njit(cache=True)
+def _since_contact(s: Any) -> tuple[float, float, float]:
+    """Slope of the load current over the way since the contact; and of a spring with a damper beside it, load = k
+    travel + c velocity, both: a damped plush that is closed on fast feels rigid."""
     number = max(s[_N], 1.0)
     spread = s[_SQQ] - s[_SQ] * s[_SQ] / number
     line = (s[_SQI] - s[_SQ] * s[_SI] / number) / max(spread, number * 1e-4)
-    # Spring and damper together, load = k travel + c velocity: a damped plush that is closed on fast feels rigid.
     xx, zz = s[_SQQ] + _RIDGE_Q * number, s[_SZZ] + _RIDGE_V * number
     determinant = xx * zz - s[_SQZ] * s[_SQZ]
     spring = (s[_SQI] * zz - s[_SZI] * s[_SQZ]) / determinant
     damper = (s[_SZI] * xx - s[_SQI] * s[_SQZ]) / determinant
-    # What the load current was on the way there, over the encoder: with a glove or a spring it rises without an object.
+    return line, spring, damper
+
+
+@njit(cache=True)
+def _before_contact(s: Any, q: float, load: float) -> tuple[float, float]:
+    """Slope of the load current over the encoder on the way there (with a glove or a spring it rises without an
+    object), and how far a load is above that line."""
     frees = max(s[_FN], 1.0)
     mean_q, mean_load = s[_FQ] / frees, s[_FI] / frees
     rise = (s[_FQI] - frees * mean_q * mean_load) / (s[_FQQ] - frees * mean_q * mean_q + _RIDGE_FREE * frees)
     expected = mean_load + rise * (q - mean_q) if s[_FN] > 0.0 else load
-    travel = q - s[_Q0] if s[_SEEN] > 0.0 else 0.0
-    free = s[_FREE] if s[_SEEN] > 0.0 else load
-    since = min(t - s[_T0], LONGEST) if s[_SEEN] > 0.0 else 0.0
+    return rise, load - expected
 
-    out[0], out[1], out[2], out[3] = i, r, q, mi
-    out[4], out[5], out[6] = _logarithm(slope, _SLOPE), _logarithm(step, _SLOPE), high - low
-    out[7], out[8], out[9], out[10] = velocity, reference_velocity, r - q, reference_velocity - velocity
-    out[11], out[12] = _logarithm(ratio, _RATIO), _logarithm(step_q, _RATIO)
-    out[13], out[14] = free, abs(i) - s[_I0] if s[_SEEN] > 0.0 else 0.0
-    out[15], out[16], out[17], out[18] = s[_Q0], s[_V0], since, travel
-    out[19] = _logarithm((abs(i) - s[_I0]) / max(abs(travel), 0.01), _RATIO) if s[_SEEN] > 0.0 else 0.0
-    out[20] = _logarithm(line, _RATIO)
-    out[21], out[22] = _logarithm(s[_STEEP], _SLOPE), _logarithm(s[_STEEP_Q], _RATIO)
-    out[23], out[24] = s[_RISE], s[_TRAVEL]
-    out[25] = (abs(i) - s[_I0]) / max(s[_RISE], 0.02)
-    out[26], out[27], out[28] = load, load - free, s[_LOAD_RISE]
-    out[29] = _logarithm(s[_LOAD_RISE] / max(s[_TRAVEL], 0.02), _RATIO)
-    out[30] = acceleration
-    out[31] = min(t - s[_ONSET], 2.0 * LONGEST)
-    out[32], out[33] = _logarithm(spring, _RATIO), _logarithm(damper, _DAMPING)
-    out[34], out[35] = rise, load - expected
+
+@njit(cache=True)
+def window_features(s: Any, t: float, i: float, r: float, q: float, mask: float, out: Any) -> bool:
+    """Take one sample into the state s and write its features (len(WINDOW_NAMES),) to out.
+
+    t s; i A; r, q rad; mask s. True where the start of a closure makes the sample void.
+    """
+    _take(s, t, i, r, q)
+    m = min(int(s[_COUNT]), SAMPLES)
+    mean, extent, slope, reference_velocity, velocity, ratio = _over_window(s, m)
+    step, step_q = _last_step(s, m)
+    speed, acceleration = _motion(s, m, velocity)
+    load = abs(i) - INERTIA * acceleration - VISCOUS * speed - SPRING * q
+    blind = t - s[_ONSET] < mask
+    if not blind:
+        _follow(s, t, i, q, load, velocity, speed, max(slope, step), ratio)
+    line, spring, damper = _since_contact(s)
+    rise, above_line = _before_contact(s, q, load)
+    seen = s[_SEEN] > 0.0
+    free = s[_FREE] if seen else load
+    above = abs(i) - s[_I0] if seen else 0.0
+    travel = q - s[_Q0] if seen else 0.0
+    # In the order of WINDOW_NAMES; a longer tuple is none to numba.
+    window = (
+        i,
+        r,
+        q,
+        mean,
+        _logarithm(slope, _SLOPE),
+        _logarithm(step, _SLOPE),
+        extent,
+        velocity,
+        reference_velocity,
+        r - q,
+        reference_velocity - velocity,
+        _logarithm(ratio, _RATIO),
+        _logarithm(step_q, _RATIO),
+    )
+    grasp = (
+        free,
+        above,
+        s[_Q0],
+        s[_V0],
+        min(t - s[_T0], LONGEST) if seen else 0.0,
+        travel,
+        _logarithm(above / max(abs(travel), 0.01), _RATIO),
+        _logarithm(line, _RATIO),
+        _logarithm(s[_STEEP], _SLOPE),
+        _logarithm(s[_STEEP_Q], _RATIO),
+        s[_RISE],
+        s[_TRAVEL],
+        (abs(i) - s[_I0]) / max(s[_RISE], 0.02),
+        load,
+        load - free,
+        s[_LOAD_RISE],
+        _logarithm(s[_LOAD_RISE] / max(s[_TRAVEL], 0.02), _RATIO),
+        acceleration,
+        min(t - s[_ONSET], 2.0 * LONGEST),
+        _logarithm(spring, _RATIO),
+        _logarithm(damper, _DAMPING),
+        rise,
+        above_line,
+    )
+    for k in range(len(window)):
+        out[k] = window[k]
+    for k in range(len(grasp)):
+        out[len(window) + k] = grasp[k]
     return blind
 
 
