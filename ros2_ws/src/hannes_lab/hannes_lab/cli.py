@@ -192,7 +192,9 @@ def hide(
         str, typer.Option("--model", help="Model file, or the name of a shipped model.")
     ] = "nominal",
     seed: Annotated[int, typer.Option(min=0, help="Seed of hand, scatter and noise.")] = 0,
-    closures: Annotated[int, typer.Option(min=1, help="Closures per condition.")] = 13,
+    closures: Annotated[
+        int, typer.Option(min=1, help="Closures per condition; of each recording the first may be left out.")
+    ] = 13,
     conditions: Annotated[
         list[str] | None,
         typer.Option(

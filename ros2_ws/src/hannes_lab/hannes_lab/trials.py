@@ -72,6 +72,9 @@ FOLLOWED = 0.25
 MOST_TOLD = 4
 """Gaps that are told one by one."""
 
+SAME_KIND = 0.03
+"""Part of the smaller span within which the references of closures of one condition are alike."""
+
 USUAL = 0.8
 """Part of its condition's usual length that a closure has at least; of less it was cut off."""
 
@@ -549,7 +552,7 @@ def _kinds(shapes: Sequence[Array], ticks: float) -> list[list[int]]:
     def apart(k: int, m: int) -> float:
         """Largest difference as far as both go, in what it may be; infinite beyond."""
         one, other, n = shapes[k], shapes[m], min(sizes[k], sizes[m])
-        most = 0.03 * min(heights[k], heights[m]) + max(slopes[k], slopes[m]) + 1e-9
+        most = SAME_KIND * min(heights[k], heights[m]) + max(slopes[k], slopes[m]) + 1e-9
         few = max(1, n // 50)  # most that differ do so in a few samples already
         for some in (slice(0, n, few), slice(0, n)):
             largest = float(np.max(np.abs(one[some] - other[some])))
@@ -685,8 +688,9 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     if len(kinds) > 1:
         told = ", ".join(f"{kind} ({in_words(count)})" for kind, count in kinds.items())
         notes.append(
-            f"the references of its closures differ, so they are {len(kinds)} conditions: {told}; a closure that was "
-            "broken off is one of its own; --object NAME=soft says what was grasped in one of them"
+            f"the references of its closures differ by more than {100 * SAME_KIND:.0f} % of their span, so they are "
+            f"{len(kinds)} conditions: {told} (another amplitude, hold or rest, or one that was broken off); --object "
+            "NAME=soft says what was grasped in one of them"
         )
     options = {key: meta[key] for key in ("object", "sensors", "plant") if key in meta}
     if "sensors" in options and "motor_current" in samples:
