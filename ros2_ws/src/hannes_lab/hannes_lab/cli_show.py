@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hannes_description.output import TEXT_WIDTH, estimate, number, show_table, text_console, with_unit
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
@@ -26,7 +26,9 @@ def show_comparison(result: Comparison) -> None:
     console = text_console()
     table = Table(title=f"Error of model '{result.model.name}'" + (" (fitted)" if result.fitted else ""))
     for name in ("condition", "signal", "phase", "RMSE", "bias", "repeatability", "ratio", ""):
-        table.add_column(name, justify="left" if name in ("condition", "signal", "phase", "") else "right")
+        side: JustifyMethod = "left" if name in ("condition", "signal", "phase", "") else "right"
+        # conditions fold where it is narrow; a signal that is cut cannot be searched for
+        table.add_column(name, justify=side, overflow="fold", no_wrap=name != "condition")
     for c in result.cells:
         table.add_row(
             c.condition,
@@ -47,7 +49,8 @@ def show_comparison(result: Comparison) -> None:
     for name in (
         ("condition", "figure", "measured", "sd", "model", "relative error") if result.metrics else ()
     ):
-        table.add_column(name, justify="left" if name in ("condition", "figure") else "right")
+        side = "left" if name in ("condition", "figure") else "right"
+        table.add_column(name, justify=side, overflow="fold", no_wrap=name not in ("condition", "figure"))
     for m in result.metrics:
         table.add_row(
             m.condition,
