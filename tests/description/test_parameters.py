@@ -104,6 +104,37 @@ def test_a_wrong_parameter_is_refused(
         Parameter(value, "V", lower, upper, status, "test")
 
 
+@pytest.mark.parametrize(
+    ("value", "fixed", "tolerance", "message"),
+    [
+        (0.5, False, -0.1, r"tolerance is -0\.1; it must be 0 \(known\) or more, a part of the value"),
+        (0.5, False, float("nan"), "tolerance is nan; it must be 0"),
+        (0.5, True, 0.1, "it is fixed and has a tolerance"),
+        (0.0, False, 0.1, "a part of the value, which is 0 V"),
+    ],
+)
+def test_a_tolerance_that_says_nothing_is_refused(
+    value: float, fixed: bool, tolerance: float, message: str
+) -> None:
+    with pytest.raises(HannesError, match=message):
+        Parameter(value, "V", 0.0, 1.0, "measured", "test", fixed, tolerance)
+
+
+def test_a_tolerance_is_kept_in_the_file(tmp_path: Path) -> None:
+    entry = "{value: 0.9, unit: N.m/rad, status: measured, source: bench, tolerance: 0.1}"
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"schema: hannes/model/1\noverrides: {{wire.stiffness: {entry}}}\n")
+    model = Model.load(file)
+    assert Model.load(model.save(tmp_path / "again.yaml")).parameters["wire.stiffness"].tolerance == 0.1
+    assert model.sha256 == Model.load().with_values({"wire.stiffness": 0.9}).sha256, (
+        "simulations are the same"
+    )
+    assert model.with_values({"wire.stiffness": 0.8}).parameters["wire.stiffness"].tolerance == 0.1
+    file.write_text(file.read_text().replace("tolerance: 0.1", "tolerance: 10 %"))
+    with pytest.raises(HannesError, match="tolerance is '10 %'; it must be a number"):
+        Model.load(file)
+
+
 def test_unknown_names_list_their_group() -> None:
     with pytest.raises(HannesError, match=r"motor\.resistance, motor\.inductance"):
         load_parameters("hannes")["motor.resistanse"]

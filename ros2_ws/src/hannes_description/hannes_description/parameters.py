@@ -18,7 +18,7 @@ import yaml
 from .errors import HannesError
 
 STATUSES = ("datasheet", "published", "measured", "identified", "assumed")
-_KEYS = ("value", "unit", "lower", "upper", "status", "source", "fixed")
+_KEYS = ("value", "unit", "lower", "upper", "status", "source", "fixed", "tolerance")
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class Parameter:
     status               one of STATUSES
     source               where the number comes from
     fixed                applied, never optimised
+    tolerance            standard deviation of what the machine's value may be, as a part of `value`; 0: known; None
+                         where nobody said how well
     """
 
     value: float
@@ -38,6 +40,7 @@ class Parameter:
     status: str
     source: str
     fixed: bool = False
+    tolerance: float | None = None
 
     def __post_init__(self) -> None:
         for key in ("value", "lower", "upper"):
@@ -49,11 +52,29 @@ class Parameter:
             )
         if self.status not in STATUSES:
             raise HannesError(f"status {self.status!r} is unknown; valid are {', '.join(STATUSES)}.")
+        if self.tolerance is not None:
+            self._check(self.tolerance)
+
+    def _check(self, tolerance: float) -> None:
+        if not (math.isfinite(tolerance) and tolerance >= 0.0):
+            raise HannesError(
+                f"tolerance is {tolerance}; it must be 0 (known) or more, a part of the value (0.1: within 10 %)."
+            )
+        if tolerance and self.fixed:
+            raise HannesError("it is fixed and has a tolerance: leave one of the two out.")
+        if tolerance and self.value <= 0.0:
+            raise HannesError(
+                f"tolerance is a part of the value, which is {self.value:g} {self.unit} and must be above 0 for that."
+            )
 
     def at(self, value: float, *, status: str | None = None, source: str | None = None) -> Parameter:
-        """The same parameter with another value; the bounds are widened where they would exclude it."""
+        """The same parameter with another value; the bounds are widened where they would exclude it.
+
+        A tolerance is a part of a value: of one that is not above nought there is none.
+        """
         return replace(
             self,
+            tolerance=self.tolerance if value > 0.0 else None,
             value=float(value),
             lower=min(self.lower, float(value)),
             upper=max(self.upper, float(value)),
@@ -62,7 +83,7 @@ class Parameter:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types, for YAML and JSON; `fixed` only where it is set."""
+        """Plain types, for YAML and JSON; `fixed` and `tolerance` only where they are set."""
         out: dict[str, Any] = {
             "value": self.value,
             "unit": self.unit,
@@ -71,6 +92,8 @@ class Parameter:
             "status": self.status,
             "source": self.source,
         }
+        if self.tolerance is not None:
+            out["tolerance"] = self.tolerance
         return out | {"fixed": True} if self.fixed else out
 
     @classmethod
@@ -89,7 +112,8 @@ class Parameter:
                 + (f"missing keys {missing}; " if missing else "")
                 + f"valid keys are {', '.join(_KEYS)}."
             )
-        for key in ("value", "lower", "upper"):
+        numbers = ("value", "lower", "upper", *(("tolerance",) if "tolerance" in entry else ()))
+        for key in numbers:
             if isinstance(entry[key], bool) or not isinstance(entry[key], Real):
                 raise HannesError(
                     f"{where}: parameter '{name}': {key} is {entry[key]!r}; it must be a number."
@@ -103,6 +127,7 @@ class Parameter:
                 str(entry["status"]),
                 str(entry["source"]),
                 bool(entry.get("fixed", False)),
+                float(entry["tolerance"]) if "tolerance" in entry else None,
             )
         except (TypeError, ValueError) as error:
             raise HannesError(f"{where}: parameter '{name}': {error}") from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,6 +49,8 @@ _UNKNOWN_GAINS = {
 }
 """Gains of a controller that nobody described, with the widths of their priors (of the logarithm): the outer loop shows
 in the static error; of the inner one the thesis gives the order of magnitude.  One that is 0 stays so."""
+
+_GAINS = frozenset(f"control.{field.name}" for field in fields(DoublePIDParameters))
 
 INTEGRAL_SEEN = 0.6
 """An outer loop has an integral if that leaves less than this part of what is left without."""
@@ -272,26 +274,16 @@ class HandRig(PlantRig):
         return load_trials(paths)
 
     def nuisances(self, model: Model) -> list[Nuisance]:
-        """Priors from population.yaml; object parameters per trial with an object, the encoder's zero per trial."""
+        """Priors from population.yaml; object parameters per trial with an object, the encoder's zero per trial.
+
+        What the model's file and a recording's object say of their own tolerance goes before those.
+        """
         out, other = [], self._of_others(model)
         for name, entry in read_yaml(Path(self.population), "population file").items():
             sd, scatter, relative = float(entry["hand_sd"]), float(entry["closure_sd"]), entry["unit"] == "1"
             if name in _PER_OBJECT:
                 for trial in self.trials:
-                    if object_of(trial) is None:
-                        continue
-                    plant, _, _ = self._plant(model.without_effects(), trial)
-                    known = is_of(trial, model) and not trial.options.get("object_seen")
-                    width = sd if known else _UNKNOWN_OBJECT_SD[name]
-                    place = f"{name}@{trial.name}"
-                    unit = _OBJECT_UNITS[name]
-                    out.append(Nuisance(place, plant.get(name), width, relative, scatter, unit, not known))
-                    damping = "object.damping"
-                    if name == "object.stiffness" and not known and damping in plant.names:
-                        place = f"{damping}@{trial.name}"
-                        unit, width = _OBJECT_UNITS[damping], _UNKNOWN_DAMPING_SD
-                        own = Nuisance(place, plant.get(damping), width, True, 0.0, unit, wide=True)
-                        out.append(replace(own, effect="object_damping"))
+                    out += self._of_object(name, trial, model, Nuisance("", 1.0, sd, relative, scatter))
             elif name == _ZERO:
                 if sum(map(is_described, self.trials)) > 1:
                     out.append(Nuisance(HAND_ZERO, 0.0, sd, False, unit="rad"))
@@ -312,7 +304,30 @@ class HandRig(PlantRig):
                 own = self._nuisance(name, entry, model)
                 less = other and name in _DRY_FRICTION
                 out.append(replace(own, below=LESS_FRICTION * own.mean) if less else own)
-        return out + [replace(n, wide=True) for n in self._bench_nuisances(model)]
+        return self.as_told([*out, *(replace(n, wide=True) for n in self._bench_nuisances(model))], model)
+
+    def is_gain(self, name: str) -> bool:
+        """See PlantRig."""
+        return name in _GAINS
+
+    def _of_object(self, name: str, trial: Trial, model: Model, usual: Nuisance) -> list[Nuisance]:
+        """Priors of a parameter of a trial's object, if there is one; with its stiffness comes its damping."""
+        grasp = object_of(trial)
+        if grasp is None:
+            return []
+        plant, _, _ = self._plant(model.without_effects(), trial)
+        known = is_of(trial, model) and not trial.options.get("object_seen")
+        told = grasp.tolerance if name == "object.stiffness" else None
+        width = told or (usual.sd if known else _UNKNOWN_OBJECT_SD[name])
+        wide = not (known or told)
+        own = replace(usual, name=f"{name}@{trial.name}", mean=plant.get(name), sd=width, wide=wide)
+        out = [replace(own, unit=_OBJECT_UNITS[name])]
+        damping = "object.damping"
+        if name == "object.stiffness" and not known and damping in plant.names and plant.get(damping) > 0.0:
+            width, unit = told or _UNKNOWN_DAMPING_SD, _OBJECT_UNITS[damping]
+            own = Nuisance(f"{damping}@{trial.name}", plant.get(damping), width, True, 0.0, unit, wide=wide)
+            out.append(replace(own, effect="object_damping"))
+        return out
 
     def _of_others(self, model: Model) -> list[Trial]:
         """Recordings of another machine than the model's."""

@@ -18,7 +18,7 @@ import numpy as np
 from hannes_control import double_pid
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
-from hannes_description.parameters import read_yaml
+from hannes_description.parameters import Parameter, read_yaml
 from hannes_description.units import any_unit, linear_unit, same_unit, tokens
 from hannes_sim import reduced
 from hannes_sim.effect import EffectType, call_own, catalogue, load_class
@@ -94,6 +94,17 @@ class Nuisance:
             raise HannesError(f"Nuisance '{self.name}': sd is {self.sd}; it must be positive.")
         if self.log and self.mean <= 0.0:
             raise HannesError(f"Nuisance '{self.name}': mean {self.mean} cannot be on a logarithmic scale.")
+
+
+def relative_prior(name: str, own: Parameter, sd: float, scatter: float = 0.0) -> Nuisance:
+    """The prior of a positive parameter whose standard deviations, from machine to machine and from closure to closure,
+    are parts of its value."""
+    mean = own.value
+    if sd <= NARROW:
+        return Nuisance(name, mean, sd * mean, False, scatter * mean, own.unit, lower=LEAST * mean)
+    # As a logarithm what is many times too small would be as far off as what is many times too large; but a
+    # friction may be nought.
+    return Nuisance(name, mean, sd, True, scatter, own.unit, lower=LEAST * mean, below=sd)
 
 
 COMES_BACK = 1e-4
@@ -261,7 +272,33 @@ class PlantRig:
                 f"{self.population}: there are no tolerances in it; give a line for each uncertain parameter, such as "
                 '`motor.kt: {sd: 0.03, closure_sd: 0.0, unit: "1", source: magnets}`.'
             )
-        return [self._within(self._nuisance(name, entry, model), model) for name, entry in table.items()]
+        usual = [self._within(self._nuisance(name, entry, model), model) for name, entry in table.items()]
+        return self.as_told(usual, model)
+
+    def as_told(self, usual: Sequence[Nuisance], model: Model) -> list[Nuisance]:
+        """Priors where the model's file says itself how well a value is known.
+
+        A tolerance of its own goes before the usual one, and makes a nuisance of a parameter that is none; what is
+        known (0) is none.
+        """
+        told = {name: model.named(name) for name in model.names if model.named(name).tolerance is not None}
+        out = []
+        for nuisance in usual:
+            own = told.pop(nuisance.name, None)
+            if own is None:
+                out.append(nuisance)
+            elif own.tolerance:
+                scatter = nuisance.closure_sd if nuisance.log else nuisance.closure_sd / own.value
+                out.append(self._within(relative_prior(nuisance.name, own, own.tolerance, scatter), model))
+        for name, own in sorted(told.items()):
+            if own.tolerance:
+                if not (name in self._plant(model, self.trials[0])[0].names or self.is_gain(name)):
+                    raise HannesError(
+                        f"{model.parameters.origin(name)}: '{name}' has a tolerance, but no fit can move it on the "
+                        f"plant '{model.plant}': take the tolerance out."
+                    )
+                out.append(self._within(relative_prior(name, own, own.tolerance), model))
+        return out
 
     def _within(self, nuisance: Nuisance, model: Model) -> Nuisance:
         """The same, kept inside the bounds that the model's file gives its parameter."""
@@ -298,11 +335,11 @@ class PlantRig:
             )
         if not relative:
             return Nuisance(name, mean, sd, False, scatter, unit)
-        if sd <= NARROW:
-            return Nuisance(name, mean, sd * mean, False, scatter * mean, unit, lower=LEAST * mean)
-        # As a logarithm what is many times too small would be as far off as what is many times too large; but a
-        # friction may be nought.
-        return Nuisance(name, mean, sd, True, scatter, unit, lower=LEAST * mean, below=sd)
+        return relative_prior(name, own, sd, scatter)
+
+    def is_gain(self, name: str) -> bool:
+        """Whether a parameter's name is that of a gain of the control law, which `run` gives it."""
+        return name.startswith("control.")
 
     def own_error(self, blocks: Sequence[Block], model: Model) -> Array:
         """See Rig."""

@@ -529,7 +529,7 @@ def _undescribed(best: Candidate) -> list[str]:
             fitted.setdefault(place, []).append(f"{name} {shown:.3g} {c.unit}".rstrip())
     whole = fitted.pop("")
     return [f"the recordings do not tell these, so they were fitted: {', '.join(whole)}"] * bool(whole) + [
-        f"{place}: fitted too, as the recording does not tell: {', '.join(own)}"
+        f"{place}: fitted too, as the recording does not tell them exactly: {', '.join(own)}"
         for place, own in fitted.items()
     ]
 
@@ -544,7 +544,8 @@ def _taken_for_its_own(search: Search, best: Candidate) -> list[str]:
             value = best.fit.values[n.name]
             notes.append(
                 f"{place or 'all recordings'}: {name} is fitted at {value / n.mean:.0f} times the nominal, as the "
-                f"recording does not tell it; if it is known to be no larger than usual, {n.effect} is missing"
+                f"recording does not tell how well it is known (an object's `tolerance` does); if it is no larger than "
+                f"usual, {n.effect} is missing"
             )
     return notes
 

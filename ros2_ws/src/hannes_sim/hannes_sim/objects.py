@@ -25,6 +25,8 @@ class GraspObject:
     damping    N.s/m
     friction   Coulomb coefficient
     place      m, offset of its centre in the palm frame from the middle of the grasp
+    tolerance  standard deviation of what stiffness and damping may be at the pulley, as a part of them; None where
+               nobody said how well they are known
     """
 
     shape: str = "capsule"
@@ -33,6 +35,7 @@ class GraspObject:
     damping: float = 2.0
     friction: float = 0.8
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tolerance: float | None = None
 
     def __post_init__(self) -> None:
         if self.shape not in SHAPES:
@@ -45,9 +48,15 @@ class GraspObject:
                 )
         if len(self.place) != 3 or not all(math.isfinite(c) for c in self.place):
             raise HannesError(f"Object place is {self.place}; it must be three finite numbers in m.")
+        if self.tolerance is not None and not (math.isfinite(self.tolerance) and self.tolerance > 0.0):
+            raise HannesError(
+                f"Object tolerance is {self.tolerance}; it must be a number above 0, a part of stiffness and damping "
+                "(0.2: within 20 %)."
+            )
 
     def to_dict(self) -> dict[str, Any]:
-        return {
+        """Plain types, for JSON; `tolerance` only where it is set."""
+        out: dict[str, Any] = {
             "shape": self.shape,
             "size": self.size,
             "stiffness": self.stiffness,
@@ -55,6 +64,7 @@ class GraspObject:
             "friction": self.friction,
             "place": list(self.place),
         }
+        return out if self.tolerance is None else {**out, "tolerance": self.tolerance}
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> GraspObject:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from hannes_description.output import number, print_json, print_table
 
 from .options import JsonOption
+
+if TYPE_CHECKING:
+    from hannes_description.parameters import Parameter
 
 app = typer.Typer(
     help="Models: nominal parameters plus effects.",
@@ -64,17 +67,33 @@ def show(
     variant = ", ".join(f"{key} {value}" for key, value in loaded.variant.items()) or "none"
     typer.echo(f"{loaded.name}: plant {loaded.plant}, controller {loaded.controller}, variant {variant}")
     typer.echo(f"sha256 {loaded.sha256}\n")
-    columns = ("parameter", "value", "unit", "lower", "upper", "status", "source")
+    columns = ("parameter", "value", "unit", "lower", "upper", "known to", "status", "source")
     groups = [("Parameters", parameters)]
     groups += [(f"Effect {effect.name}", dict(effect.parameters)) for effect in loaded.effects]
     for title, entries in groups:
         rows = [
-            (name, number(p.value), p.unit, number(p.lower), number(p.upper), p.status, p.source)
+            (
+                name,
+                number(p.value),
+                p.unit,
+                number(p.lower),
+                number(p.upper),
+                _known_to(p),
+                p.status,
+                p.source,
+            )
             for name, p in entries.items()
         ]
         print_table(title, columns, rows, right=(1, 3, 4))
     if not loaded.effects:
         typer.echo("\nNo effects beyond the nominal model.")
+
+
+def _known_to(p: Parameter) -> str:
+    """How well a parameter is known, where its entry says so."""
+    if p.tolerance is None:
+        return ""
+    return f"{100 * p.tolerance:.3g} %" if p.tolerance else "exactly"
 
 
 @app.command()
