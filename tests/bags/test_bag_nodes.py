@@ -26,6 +26,8 @@ from hannes_bags.storage import BagMessages, locate
 from hannes_bags.writing import write_recording
 from hannes_description.errors import HannesError
 from patience import PATIENCE
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 pytestmark = [
     pytest.mark.ros,
@@ -549,3 +551,25 @@ def test_old_health_is_played_only_by_its_name(start: Start, tmp_path: Path) -> 
     bag = str(foreign_bag(tmp_path / "bag", messages))
     assert "played 20 messages" in end(start("player", bag=bag))
     assert "played 1 messages" in end(start("player", bag=bag, topics=["/diagnostics"]))
+
+
+def test_a_topic_of_a_type_that_is_not_installed_is_left_out(start: Start, tmp_path: Path) -> None:
+    """A bag of everything has some; those that were named must be there."""
+    messages = motor_messages(np.arange(1, 11, dtype=np.int64) * 1_000_000)
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    typestore.register(get_types_from_msg("float64 x\n", "my_pkg/msg/Thing"))
+    thing = bytes(typestore.serialize_cdr(typestore.types["my_pkg/msg/Thing"](x=1.0), "my_pkg/msg/Thing"))
+    bag = tmp_path / "bag"
+    with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, (msgtype, entries) in {
+            **messages,
+            "/thing": ("my_pkg/msg/Thing", [(5_000_000, thing)]),
+        }.items():
+            connection = writer.add_connection(topic, msgtype, typestore=typestore)
+            for logged, data in entries:
+                writer.write(connection, logged, data)
+    output = end(start("player", bag=str(bag)))
+    assert "left out: /thing: The message type 'my_pkg/msg/Thing' is not installed here." in output
+    assert "played 20 messages" in output
+    told = refused(start("player", bag=str(bag), topics=["/thing"]))
+    assert "/thing: The message type 'my_pkg/msg/Thing' is not installed here. Install" in told

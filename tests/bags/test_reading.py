@@ -10,6 +10,7 @@ import yaml
 import zstandard
 from bags.bag_samples import MOTOR, foreign_bag, motor_messages, recording
 from hannes_bags import cdr
+from hannes_bags.clocks import spread
 from hannes_bags.mcap_file import Limits
 from hannes_bags.reading import RecordingWarning, bag_info, read_bag
 from hannes_bags.recording import Recording
@@ -492,3 +493,22 @@ def test_a_split_bag(bag: Path) -> None:
     back = read_bag(bag)
     for name, channel in whole.channels.items():
         assert np.array_equal(back[name].values, channel.values)
+
+
+def test_times_of_a_slow_clock_are_spread(tmp_path: Path) -> None:
+    """`ros2 bag play --clock` ticks at 40 Hz: what has no header has one time for 25 messages."""
+    stamps = np.arange(0, 2000, dtype=np.int64) * 1_000_000
+    coarse = stamps // 25_000_000 * 25_000_000
+    bag = foreign_bag(tmp_path / "bag", motor_messages(stamps, coarse))
+    with pytest.warns(
+        RecordingWarning, match=r"come in steps of 25 ms .* spread over it, on /hannes/motor/current"
+    ):
+        found = read_bag(bag)
+    current = found["motor_current"]
+    assert current.time.size == 2000, "none repeats the one before"
+    np.testing.assert_allclose(current.time - current.time[0], stamps * 1e-9, atol=2e-3)
+    assert (np.diff(current.time) > 0.0).all()
+    times, step = spread(np.array([5, 5, 5]))
+    assert step == 0 and times.tolist() == [5, 5, 5]
+    times, step = spread(np.array([0, 0, 10, 10, 10, 10, 90, 90]))
+    assert step == 45 and times.tolist() == [0, 5, 10, 21, 32, 43, 90, 112]

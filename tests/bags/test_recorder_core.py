@@ -170,3 +170,23 @@ def test_what_is_played(tmp_path: Path) -> None:
     with pytest.raises(HannesError, match="nothing is left after 100"):
         load_playlist(bag, start=100.0)
     assert bag_info(bag).duration == pytest.approx(load_playlist(bag).duration)
+
+
+def test_a_clock_that_goes_back_is_counted() -> None:
+    times = SimulatedTimes("/clock")
+    for sent, value in enumerate((0, 1, 2, 3, 0, 1), start=1):
+        times.heard(cdr.encode_clock(np.array([value * MS]))[0], sent)
+    assert (times.ticks, times.went_back) == (6, 1)
+    late = SimulatedTimes("/clock")
+    for sent, value in ((1, 0), (3, 2), (2, 1)):
+        late.heard(cdr.encode_clock(np.array([value * MS]))[0], sent)
+    assert late.went_back == 0, "one that overtook another did not go back"
+
+
+def test_the_clock_of_a_bag_is_played_where_it_is_named(tmp_path: Path) -> None:
+    messages = motor_messages(np.arange(1, 4, dtype=np.int64) * MS)
+    messages["/clock"] = ("rosgraph_msgs/msg/Clock", [(MS, cdr.encode_clock(np.array([5 * MS]))[0])])
+    bag = foreign_bag(tmp_path / "bag", messages)
+    assert {topic for topic, _ in load_playlist(bag, topics=["/clock"], clock=True).entries} == {"/clock"}
+    for named in ((), ("/clock", "/hannes/motor/state")):
+        assert "/clock" not in {topic for topic, _ in load_playlist(bag, topics=named).entries}

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hannes_control.double_pid import N_STATES, DoublePID, DoublePIDParameters, control
-from hannes_control.reference import FULL_CLOSURE, half_sine, make_profile, ramp_hold, reversals
+from hannes_control.reference import FULL_CLOSURE, PROFILES, half_sine, make_profile, ramp_hold, reversals
 from hannes_description.control_ports import C_CURRENT, C_PERIOD, C_POSITION, C_REFERENCE, N_CONTROL_INPUTS
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
@@ -132,3 +132,9 @@ def test_the_outer_integral_does_not_wind_up() -> None:
         assert abs(law.current_reference) <= 4.6
     after = [law.update(-1.0, 0.0, 0.0) and law.current_reference for _ in range(20)]
     assert after[-1] < 0.0
+
+
+def test_a_profile_of_more_samples_than_memory_holds_is_refused() -> None:
+    for make in PROFILES.values():
+        with pytest.raises(HannesError, match="at most 20000000 are made"):
+            make(closures=1000, period=1e5)

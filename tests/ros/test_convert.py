@@ -68,3 +68,10 @@ def test_other_joints_are_refused(names, position):
 def test_other_lengths_are_refused():
     with pytest.raises(HannesError, match="have 2, 0 and 0 entries, expected 1 each"):
         convert.MOTOR_STATE.decode(serialize_message(JointState(name=["motor_pulley"], position=[1.0, 2.0])))
+
+
+def test_a_damaged_message_is_no_number_and_no_joint():
+    assert math.isnan(convert.float64_value(convert.float64_bytes(1.0)[:9]))
+    whole = convert.MOTOR_STATE.encode(1, (1.0,), (2.0,), (3.0,))
+    with pytest.raises(HannesError, match="a message of 20 bytes is no JointState"):
+        convert.MOTOR_STATE.decode(whole[:20])

@@ -179,3 +179,17 @@ def test_an_emg_of_another_rate_is_told(peer):
         status = peer.status("emg_reference")
     assert status["level"] == "1" and status["message"].startswith("EMG comes at ")
     assert all(0.0 < float(rate) < 100.0 for rate in status["emg_rates_hz"].split(", "))
+
+
+def test_source_rests_until_the_motor_is_driven(peer):
+    """On a machine that still compiles the hand, the only closure would be over before there is one."""
+    peer.hear(*EMG)
+    peer.hear_diagnostics()
+    with processes(NodeProcess("emg_source", begin="driven", rate=100)):
+        peer.matched("motor_voltage")
+        peer.until_status("emg_source", lambda s: "waiting for motor/voltage" in s["message"])
+        peer.until(lambda: len(peer.heard["emg_flexor"]) > 20, what="rest")
+        assert set(values(peer, "emg_flexor")) == {0.0}
+        peer.say("motor_voltage", convert.float64_bytes(0.0))
+        peer.until(lambda: any(values(peer, "emg_flexor")), what="a contraction")
+        peer.until_status("emg_source", lambda s: s["message"] == "running")

@@ -45,7 +45,7 @@ def test_lockstep_advances_one_tick_for_one_voltage(peer):
 def test_not_finite_commands_give_zero_volt_and_are_counted_and_large_ones_are_clamped(peer):
     peer.hear("encoder_position", "motor_current")
     peer.hear_diagnostics()
-    with processes(NodeProcess("hand_sim", clock="lockstep", **PATIENT)):
+    with processes(NodeProcess("hand_sim", clock="lockstep", **PATIENT)) as (sim,):
         peer.matched("motor_voltage")
         states, currents = peer.heard["encoder_position"], peer.heard["motor_current"]
         commands = [math.nan, math.inf, -math.inf, 1e9]
@@ -54,6 +54,9 @@ def test_not_finite_commands_give_zero_volt_and_are_counted_and_large_ones_are_c
             say_voltage(peer, voltage)
         peer.until(lambda: len(states) == len(currents) == 6)
         status = peer.until_status("hand_sim", lambda s: s["tick"] == "5", "the counts")
+        peer.until(
+            lambda: "motor/voltage is not finite (-inf): 0 V" in sim.output, what="the reason in the log"
+        )
     assert (status["rejected_commands"], status["clamped_commands"]) == ("3", "1")
     current = [convert.float64_value(data) for data in peer.heard["motor_current"]]
     assert current[1:4] == [0.0, 0.0, 0.0]

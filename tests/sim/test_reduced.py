@@ -8,10 +8,12 @@ from hannes_control.double_pid import DoublePID
 from hannes_control.reference import half_sine
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_sim.effect import catalogue
 from hannes_sim.factory import make_plant
 from hannes_sim.measurement import BENCH, THESIS, Sensors, folded_mean, logger
 from hannes_sim.objects import OBJECTS, GraspObject
 from hannes_sim.plant import PlantDiverged
+from hannes_sim.ports import R_Q
 from hannes_sim.reduced import ReducedPlant
 from hannes_sim.rollout import rollout
 
@@ -128,3 +130,21 @@ def test_trailing_average_and_folded_noise() -> None:
     for mean in (0.0, 0.003, 0.02):
         sampled = np.abs(mean + 0.005 * rng.standard_normal(200_000)).mean()
         assert folded_mean(np.array([mean]), 0.005)[0] == pytest.approx(sampled, rel=0.01)
+
+
+@pytest.mark.parametrize(("name", "pushed"), [("glove_stiffness", 200), ("gravity", 0)])
+def test_a_mass_on_a_spring_or_with_a_weight_keeps_its_energy(name: str, pushed: int) -> None:
+    """Without friction it swings on for ever: a force of where it was a step ago would push it."""
+    model = Model.load().with_effect(catalogue()[name].entry())
+    plant = ReducedPlant(model)
+    for parameter in ("wire.stiffness", "friction.coulomb", "friction.viscous", "encoder.resolution"):
+        plant.set(parameter, 0.0)
+    plant.set("motor.emf_compensated", 1.0)
+    if pushed:
+        plant.advance(3.0, pushed)  # away from where it rests
+    places = []
+    for _ in range(20_000):
+        plant.advance(0.0, 4)
+        places.append(plant.reading[R_Q])
+    swings = [float(np.ptp(places[k : k + 5000])) for k in range(0, 20_000, 5000)]
+    assert max(swings) < 1.002 * min(swings)

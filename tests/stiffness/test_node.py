@@ -211,11 +211,37 @@ def test_in_real_time_it_survives_bad_values_gaps_and_a_restart(bench, closure):
             and int(it.health.get("restarts", 0)) >= 2
         )
     )
-    assert it.health["message"] == "classifying"
+    it.wait(lambda: it.health["message"] == "classifying")
     assert it.health["classifier_sha256"] == StiffnessClassifier.load().manifest["onnx"]["sha256"][:12]
     code, output = it.end(signal.SIGTERM)
     assert code == 0, output
     assert "Traceback" not in output
+
+
+def test_what_it_does_not_answer_is_said(bench, closure):
+    it = bench("clock:=realtime")
+    clock = iter(np.arange(1, 100_000) * 0.01)
+
+    def said(words, current, encoder, stamped=True):
+        def heard():
+            it.publish(next(clock) if stamped else 0.0, current, 5.0, encoder)
+            return words in it.health["message"]
+
+        it.wait(heard)
+        return it.health["level"]
+
+    assert said("motor/current is not finite (nan): no answer", float("nan"), 1.0) == 2
+    assert said("motor/state is not finite (nan)", 1.0, float("nan")) == 2
+    assert said("no hand has 400 A", 400.0, 1.0) == 2
+    assert said("classifying", 0.4, 1.0) == 0
+    assert said("no answer to motor/state (", 0.4, 1.0, stamped=False) == 1
+    other = convert.joint_message(["elbow"], JointSample(2_030_000_000, (1.0,)))
+
+    def rejected():
+        it.out["encoder_position"].publish(other)
+        return "motor/state is rejected: the joints are ['elbow']" in it.health["message"]
+
+    it.wait(rejected)
 
 
 def test_a_second_source_is_an_error_and_ends_a_lockstep_that_waits_for_what_it_is_ahead_of(bench):

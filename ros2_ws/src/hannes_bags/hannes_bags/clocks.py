@@ -13,6 +13,9 @@ the two do not compare: the log times are then carried over onto the clock of th
             lies between the stamped messages around it, so its time is right to one period of that topic and
             no better.
 - log       nothing is stamped: everything is on the recorder's clock.
+
+A recorder that follows a slow /clock (`ros2 bag play --clock` has 40 Hz) gives one log time to all messages between two
+of its ticks: those are spread over the tick in their order first (`spread`).
 """
 
 from __future__ import annotations
@@ -78,6 +81,25 @@ class ClockRelation:
                 "time (use_sim_time) to avoid it."
             )
         return ""
+
+
+def spread(log_ns: IntArray) -> tuple[IntArray, int]:
+    """Log times (n,) of one topic that come in steps, with the messages of a step spread over it, and the step in ns.
+
+    As they are, with a step of 0, where most messages have a time of their own.  A message was logged at or after its
+    time and before the next one; after a pause its step is one as usual.
+    """
+    if log_ns.size < 2 or np.median(np.abs(np.diff(log_ns))) > 0:
+        return log_ns, 0
+    begins = np.flatnonzero(np.concatenate([[True], np.diff(log_ns) != 0]))
+    counts = np.diff(np.append(begins, log_ns.size))
+    gaps = np.diff(log_ns[begins])
+    if not (gaps > 0).any():
+        return log_ns, 0
+    step = int(np.median(gaps[gaps > 0]))
+    room = np.append(np.clip(gaps, 0, step), step)
+    number = np.arange(log_ns.size) - np.repeat(begins, counts)
+    return log_ns + number * np.repeat(room, counts) // np.repeat(counts, counts), step
 
 
 def relate(topic: str, stamp_ns: IntArray, log_ns: IntArray) -> ClockRelation:

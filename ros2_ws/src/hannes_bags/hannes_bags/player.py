@@ -50,12 +50,17 @@ class Playlist:
 
 
 def load_playlist(
-    path: str | Path, *, topics: Collection[str] = (), start: float = 0.0, limits: Limits | None = None
+    path: str | Path,
+    *,
+    topics: Collection[str] = (),
+    start: float = 0.0,
+    clock: bool = False,
+    limits: Limits | None = None,
 ) -> Playlist:
     """Read what is to be played.
 
     topics  names of the topics to play; if empty, all but /diagnostics, which would tell of nodes that run now;
-            /clock is never among them, the player makes it itself
+            /clock is among them only where it is named and `clock`: else the player makes it itself
     start   s to skip at the beginning
     Raises HannesError: unreadable bag, unknown topic, nothing left to play.
     """
@@ -63,10 +68,12 @@ def load_playlist(
     times: list[int] = []
     entries: list[tuple[str, bytes]] = []
     for topic, logged, data in messages:
-        if topic != CLOCK_TOPIC and (topic in topics if topics else topic != DIAGNOSTICS_TOPIC):
+        if topic == CLOCK_TOPIC and not (clock and topic in topics):
+            continue
+        if topic in topics if topics else topic != DIAGNOSTICS_TOPIC:
             times.append(logged)
             entries.append((topic, bytes(data)))
-    missing = sorted(set(topics) - set(messages.types) - {CLOCK_TOPIC})
+    missing = sorted(set(topics) - set(messages.types) - (set() if clock else {CLOCK_TOPIC}))
     if missing:
         raise HannesError(
             f"The bag {path} has no topic {', '.join(missing)}. It has: {', '.join(sorted(messages.types))}."

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from .player import Schedule, load_playlist
+from .player import Playlist, Schedule, load_playlist
 from .recorder_node import message_class
 from .storage import TopicEntry
 from .writing import Qos
@@ -79,7 +79,7 @@ class PlayerNode(HannesNode, Node):
     def __init__(self, cli_args: list[str] | None = None) -> None:
         super().__init__(self.node_name, namespace=DEFAULT_NAMESPACE, cli_args=cli_args)
         self._p = p = declare(self, PlayerParameters)
-        playlist = load_playlist(p.bag, topics=p.topics, start=p.start)
+        playlist = self._playable(load_playlist(p.bag, topics=p.topics, start=p.start, clock=not p.clock))
         self._schedule = Schedule(playlist, 0.0 if p.fast else p.rate, loop=p.loop)
         self._topics = playlist.topics
         # A hand in lock-step takes one command for each tick, and tells the time.
@@ -103,6 +103,25 @@ class PlayerNode(HannesNode, Node):
         )
         self.wall_timer(_STEP_S, self._step)
         self.wall_timer(_LOOK_S, self._look)
+
+    def _playable(self, playlist: Playlist) -> Playlist:
+        """Without the topics whose type is not installed here, unless they were named."""
+        missing = {}
+        for entry in playlist.topics:
+            try:
+                message_class(entry.type)
+            except HannesError as error:
+                missing[entry.name] = str(error)
+        if not missing:
+            return playlist
+        said = "; ".join(f"{topic}: {why}" for topic, why in missing.items())
+        left = [entry.name for entry in playlist.topics if entry.name not in missing]
+        if self._p.topics or not left:
+            raise HannesError(
+                f"{said} Install the package of the type, or name other topics (--topic of hannes play)."
+            )
+        self.get_logger().warning(f"left out: {said}")
+        return load_playlist(self._p.bag, topics=left, start=self._p.start)
 
     def _open(self) -> None:
         """Announce what is to be played."""

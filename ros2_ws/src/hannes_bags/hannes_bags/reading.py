@@ -21,7 +21,7 @@ from hannes_description.joints import ENCODER_JOINT, JOINT_NAMES
 from hannes_description.signals import SIGNALS, Signal
 
 from . import cdr
-from .clocks import SAME_NS, ClockRelation, relate
+from .clocks import SAME_NS, ClockRelation, relate, spread
 from .mcap_file import Limits
 from .recording import HOW_TO_NAME, LOOKS_LIKE, Channel, Recording
 from .storage import BagMessages, TopicEntry, locate
@@ -203,6 +203,8 @@ class _Reader:
         self.overrides = overrides
         self.warnings: list[str] = []
         self.repeats: dict[str, int] = {}
+        self.log_ns: dict[str, IntArray] = {}
+        self.coarse: dict[str, int] = {}
 
     def recording(self, sha256: str) -> Recording:
         chosen = self._choose()
@@ -229,6 +231,12 @@ class _Reader:
                 times, values = self._plain(topic)
                 samples[signals[0].name] = (relation.apply(times), values)
                 self._drop_repeats(topic, [signals[0].name], samples)
+        if unsure := [topic for topic in self.coarse if topic not in self.stamps]:
+            self.warnings.append(
+                f"The recorder's times come in steps of {max(self.coarse.values()) * 1e-6:.3g} ms (it followed a slow "
+                f"/clock): the messages of a step were spread over it, on {', '.join(unsure)}, and each is right to a "
+                "part of a step. Record beside a /clock that is as fast as motor/state."
+            )
         if self.repeats:
             told = ", ".join(f"{count} on {topic}" for topic, count in self.repeats.items())
             self.warnings.append(
@@ -317,7 +325,12 @@ class _Reader:
         return self._log_ns(topic), self._decode(topic, decode)
 
     def _log_ns(self, topic: str) -> IntArray:
-        return np.frombuffer(self.raw[topic].log_ns, dtype=np.int64)
+        """Log times of a topic's messages; those of a slow /clock are spread."""
+        if topic not in self.log_ns:
+            self.log_ns[topic], step = spread(np.frombuffer(self.raw[topic].log_ns, dtype=np.int64))
+            if step:
+                self.coarse[topic] = step
+        return self.log_ns[topic]
 
     def _stamped(self, topic: str, blocks: list[cdr.JointStates]) -> tuple[IntArray, IntArray] | None:
         """(stamps, log times) in the order of the topic; None if its publisher does not stamp."""

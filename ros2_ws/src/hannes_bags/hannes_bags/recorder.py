@@ -45,11 +45,15 @@ class SimulatedTimes:
     hold_ns      a message waits for the /clock after it at most this long (by `taken_ns`); it bounds what a
                  kill can take, but for what comes before the first /clock, which waits for it
     misplaced    messages that were given out before a /clock came that had been sent before them: they count too early
+    ticks        messages of /clock so far
+    went_back    how often it was earlier than the one before: another run has begun, or a player loops
     """
 
     clock_topic: str
     hold_ns: int = 120_000_000
     misplaced: int = 0
+    ticks: int = 0
+    went_back: int = 0
     _guessed: deque[int] = field(default_factory=lambda: deque(maxlen=_CLOCKS_KEPT))
     _waiting: list[Received] = field(default_factory=list)
     _sent: list[int] = field(default_factory=list)
@@ -69,7 +73,9 @@ class SimulatedTimes:
         place = bisect_right(self._sent, sent_ns)
         self._sent.insert(place, sent_ns)
         self._values.insert(place, value)
+        self.ticks += 1
         if place == len(self._sent) - 1:  # of one that overtook another, nothing is known yet
+            self.went_back += place > 0 and value < self._values[place - 1]
             self.misplaced += sum(sent >= sent_ns for sent in self._guessed)
             self._guessed.clear()
         if len(self._sent) > 2 * _CLOCKS_KEPT:

@@ -43,6 +43,8 @@ _DEPTH = 4000
 _MOST_AT_ONCE = 5000
 _LEADING = SIGNALS["encoder_position"].topic
 _DRIVING = SIGNALS["motor_voltage"].topic
+_COARSE = 2
+"""Messages of motor/state for each of /clock from which that is too slow to tell the times of others."""
 _TYPES = {
     **{signal.topic: signal.type for signal in SIGNALS.values()},
     CLOCK_TOPIC: CLOCK_TYPE,
@@ -158,6 +160,8 @@ class RecorderNode(HannesNode, Node):
         self._elsewhere_at = time.monotonic() + _LATE_S
         self._recorder: Recorder | None = None
         self._begun: set[str] = set()
+        self._states = 0
+        self._said_back = 0
         self._unwritten: HannesError | None = None
         self._stop_sync = threading.Event()
         self._sync = threading.Thread(target=self._keep_on_disk, name="sync", daemon=True)
@@ -176,6 +180,12 @@ class RecorderNode(HannesNode, Node):
         if not self._decided:
             self._decide()
         self._look_for_the_hand()
+        if self._simulated and self._times.went_back > self._said_back:
+            self._said_back = self._times.went_back
+            self.get_logger().error(
+                f"{self._clock} went back: another run has begun, or a player loops. This bag holds both and cannot be "
+                "read as one; record each run into a bag of its own"
+            )
         if self._simulated and self._decided:
             self._clocks.several()
             if self._recorder is not None and self._times.latest is None and time.monotonic() > self._late_at:
@@ -183,6 +193,12 @@ class RecorderNode(HannesNode, Node):
                     f"waiting for {self._clock}: until it comes, nothing is written (clock:=computer does without)",
                     throttle_duration_sec=10.0,
                 )
+        try:
+            self._listen_to_all()
+        except HannesError as error:
+            self.fail(f"{error} Install its package, or leave the topic out.")
+
+    def _listen_to_all(self) -> None:
         for topic, msgtype in self._wanted.items():
             if topic == self._leading and not self._may_lead():
                 continue
@@ -299,6 +315,7 @@ class RecorderNode(HannesNode, Node):
                 self._begin(topic)
                 if topic == self._leading:
                     self._check_stamp(data, sent_ns)
+            self._states += topic == self._leading
             assert self._recorder is not None
             self._recorder.take(topic, data, info, now_ns)
         return count
@@ -388,7 +405,8 @@ class RecorderNode(HannesNode, Node):
         if self._sync.is_alive():
             self._sync.join(timeout=5.0)
         if self._recorder is None:
-            self.get_logger().warning("no message came: there is no bag")
+            if self.failure is None:
+                self.get_logger().warning("no message came: there is no bag")
         else:
             self._close(self._recorder)
         self._ears.destroy_node()
@@ -410,6 +428,15 @@ class RecorderNode(HannesNode, Node):
             self.get_logger().warning(
                 f"{recorder.misplaced} messages have too early a log time: {self._clock} came more than "
                 f"{self._times.hold_ns * 1e-6:.0f} ms after them. Do not use the log times of what has no header."
+            )
+        if self._simulated and self._states > _COARSE * self._times.ticks > 0:
+            self.get_logger().warning(
+                f"{self._clock} came {self._times.ticks} times for {self._states} messages of {self._leading}: times "
+                "of what has no header are known to one of its steps only. Let it come as often as the fastest topic"
+            )
+        if self._simulated and self._times.went_back:
+            self.get_logger().error(
+                f"{self._clock} went back: the bag holds more than one run, and is none to compare"
             )
         self.get_logger().info(f"{recorder.writer.message_count} messages in {self._p.output}")
         named = self._p.topics or (signal("reference_position").topic,)

@@ -15,6 +15,7 @@ from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 
 from .emg import EmgRecording, SyntheticEmg, read_emg_csv, synthesise
 
@@ -34,7 +35,12 @@ class EmgSourceParameters:
         1, "subscribers that each channel must have before the first sample in lockstep", lower=1, upper=100
     )
     seed: int = parameter(0, "seed of the synthetic EMG", lower=0, upper=2**31)
-    closures: int = parameter(1, "closures of the synthetic EMG", lower=1, upper=100000)
+    begin: str = parameter(
+        "at_once",
+        "when the samples begin in real time: at_once, or driven: with the first motor/voltage, rest (0 V) before it",
+        choices=("at_once", "driven"),
+    )
+    closures: int = parameter(1, "closures of the synthetic EMG", lower=1, upper=10000)
     close_time: float = parameter(1.6, "contraction of the flexor", lower=0.1, upper=100.0, unit="s")
     hold_time: float = parameter(1.0, "rest between closing and opening", lower=0.0, upper=100.0, unit="s")
     open_time: float = parameter(1.6, "contraction of the extensor", lower=0.1, upper=100.0, unit="s")
@@ -72,12 +78,8 @@ class EmgSource(HannesNode, Node):
     def __init__(self, cli_args: list[str] | None = None) -> None:
         super().__init__(self.node_name, namespace=DEFAULT_NAMESPACE, cli_args=cli_args)
         self._p = p = declare(self, EmgSourceParameters)
-        recording = p.recording()
-        self._samples = [
-            tuple(map(convert.float64_bytes, pair))
-            for pair in zip(recording.flexor.tolist(), recording.extensor.tolist(), strict=True)
-        ]
-        self._rest = (convert.float64_bytes(0.0), convert.float64_bytes(0.0))
+        self._recording = recording = p.recording()
+        self._size = recording.flexor.size
         self._sent = 0
         self._until = 0
         self._stamp = -1
@@ -100,9 +102,14 @@ class EmgSource(HannesNode, Node):
         self._loop = RealtimeLoop(1.0 / p.rate, self._step)
         self._diagnostics = Diagnostics(self, self._health, self._status)
         self.wall_timer(_CHECK_S, self._check)
+        self._driven: Subscription | None = None
+        self._waits = False
         if self._lockstep:
             topics.subscription(self, "encoder_position", self._on_tick_state)
         else:
+            if p.begin == "driven":
+                self._waits = True
+                self._driven = topics.subscription(self, "motor_voltage", self._on_voltage)
             self._loop.start()
         self.get_logger().info(f"{p.file or 'synthetic EMG'}: {recording.duration:.1f} s at {p.rate} Hz")
 
@@ -113,14 +120,29 @@ class EmgSource(HannesNode, Node):
     def _send(self, until: int) -> None:
         """Publish the samples before number `until` that were not sent yet."""
         while self._sent < until:
-            flexor, extensor = self._samples[self._sent] if self._sent < len(self._samples) else self._rest
-            self._flexor.publish(flexor)
-            self._extensor.publish(extensor)
+            if self._sent < self._size:
+                self._publish(
+                    *(float(c[self._sent]) for c in (self._recording.flexor, self._recording.extensor))
+                )
+            else:
+                self._publish(0.0, 0.0)
             self._sent += 1
-            self._health.cycles += 1
+
+    def _publish(self, flexor: float, extensor: float) -> None:
+        self._flexor.publish(convert.float64_bytes(flexor))
+        self._extensor.publish(convert.float64_bytes(extensor))
+        self._health.cycles += 1
 
     def _step(self, now: float, elapsed: int) -> None:
-        self._send(self._sent + elapsed)
+        if self._waits:
+            for _ in range(elapsed):
+                self._publish(0.0, 0.0)
+        else:
+            self._send(self._sent + elapsed)
+
+    def _on_voltage(self, data: bytes) -> None:
+        """The loop is closed: somebody drives the motor."""
+        self._waits = False
 
     def _on_tick_state(self, data: bytes) -> None:
         """In lock-step the samples follow the stamps of motor/state."""
@@ -139,15 +161,20 @@ class EmgSource(HannesNode, Node):
     def _check(self) -> None:
         if self._lockstep and not self._peers.complete and not self._peers.missing():
             self._send(self._until)
+        if self._driven is not None and not self._waits:
+            self.destroy_subscription(self._driven)
+            self._driven = None
         if self._loop.error is not None:
             self.fail(f"The EMG stopped: {self._loop.error!r}")
 
     def _status(self) -> tuple[bytes, str, dict[str, object]]:
         self._health.missed = self._loop.missed
-        values: dict[str, object] = {"samples": len(self._samples), "sent": self._sent}
+        values: dict[str, object] = {"samples": self._size, "sent": self._sent}
         if self._lockstep and (missing := self._peers.missing()):
             return WARN, f"waiting for {', '.join(missing)}", values
-        return OK, "running" if self._sent < len(self._samples) else "played to the end: rest", values
+        if self._waits:
+            return WARN, "rest, waiting for motor/voltage: nobody drives the motor yet", values
+        return OK, "running" if self._sent < self._size else "played to the end: rest", values
 
 
 def main() -> None:

@@ -17,10 +17,19 @@ FULL_CLOSURE = 40000 * RAD_PER_COUNT
 Profile = NDArray[np.float64]
 
 
-def _check(**values: float) -> None:
-    for name, value in values.items():
+MOST = 20_000_000
+"""Samples of a profile: five hours at 1 kHz, 160 MB."""
+
+
+def _check(*, closures: float, period: float, dt: float, **more: float) -> None:
+    for name, value in {"closures": closures, "period": period, "dt": dt, **more}.items():
         if not math.isfinite(value) or value <= 0.0:
             raise HannesError(f"Reference profile: {name} is {value}; it must be a positive number.")
+    if closures * period / dt > MOST:
+        raise HannesError(
+            f"Reference profile: {closures:g} closures of {period:g} s take {closures * period / dt:.3g} samples of "
+            f"{dt:g} s; at most {MOST} are made. Ask for fewer, or give the reference by its topic."
+        )
 
 
 def half_sine(

@@ -11,6 +11,7 @@ to its own size counted from the end of the header; strings are a length includi
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from typing import Final
 from builtin_interfaces.msg import Time
 from hannes_description.errors import HannesError
 from hannes_description.joints import ENCODER_JOINT, JOINT_NAMES
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
@@ -49,10 +51,13 @@ def float64_bytes(value: float) -> bytes:
 
 
 def float64_value(data: bytes) -> float:
-    """The number in a serialised std_msgs/Float64."""
+    """The number in a serialised std_msgs/Float64; NaN where that is damaged, as of any other number that is none."""
     if len(data) == 12 and data[:4] == _HEADER:
         return _FLOAT64.unpack(data)[1]
-    return float(deserialize_message(data, Float64).data)
+    try:
+        return float(deserialize_message(data, Float64).data)
+    except rclpy_implementation.RMWError:
+        return math.nan
 
 
 def clock_bytes(stamp_ns: int) -> bytes:
@@ -161,7 +166,7 @@ class JointCodec:
         )
 
     def decode(self, data: bytes) -> JointSample:
-        """The sample in a serialised JointState; HannesError as `joint_sample`."""
+        """The sample in a serialised JointState; HannesError as `joint_sample`, and where the message is damaged."""
         if len(data) == self._struct.size:
             parts = self._struct.unpack(data)
             second, third = self._second, self._third
@@ -177,7 +182,11 @@ class JointCodec:
                     parts[second + 1 : third],
                     parts[third + 1 :],
                 )
-        return joint_sample(self.names, deserialize_message(data, JointState))
+        try:
+            message = deserialize_message(data, JointState)
+        except rclpy_implementation.RMWError as error:
+            raise HannesError(f"a message of {len(data)} bytes is no JointState") from error
+        return joint_sample(self.names, message)
 
 
 MOTOR_STATE: Final = JointCodec((ENCODER_JOINT,), effort=True)

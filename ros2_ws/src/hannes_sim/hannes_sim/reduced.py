@@ -138,6 +138,8 @@ def _advance(handle, voltage, steps):  # type: ignore[no-untyped-def]
         stand(handle, q, ql)
     for _ in range(steps):
         command = begin_step(handle, voltage, q, v)
+        if p[_WIRE_K] <= 0.0:
+            ql, vl = q, v  # one mass: a spring that saw where it was a step ago would give energy
         x[QL], x[VL], x[LOAD], x[CONTACT] = ql, vl, load, contact
         evaluate_effects(handle)
         torque = motor_torque(handle, command, v) + y[TORQUE]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass, replace
 from time import monotonic
@@ -242,7 +243,15 @@ class HandSim(HannesNode, Node):
 
     # -- real time ---------------------------------------------------------------------------------------------------
     def _on_voltage(self, data: bytes) -> None:
-        self._gate.command(convert.float64_value(data), monotonic())
+        self._gate.command(self._judged(convert.float64_value(data)), monotonic())
+
+    def _judged(self, voltage: float) -> float:
+        """The voltage; one that is not finite is said: the hand stands as if nobody drove it."""
+        if math.isfinite(voltage):
+            self._health.faults.good("motor/voltage")
+        else:
+            self._health.faults.bad("motor/voltage", ERROR, f"motor/voltage is not finite ({voltage}): 0 V")
+        return voltage
 
     def _step(self, now: float, elapsed: int) -> None:
         """One period of the real-time thread; periods that were missed are made up for, within reason."""
@@ -295,7 +304,7 @@ class HandSim(HannesNode, Node):
 
     def _take(self, voltage: float) -> None:
         self._waiting = False
-        if self._advance(self._gate.command(voltage, monotonic()), 1):
+        if self._advance(self._gate.command(self._judged(voltage), monotonic()), 1):
             self._publish_tick()
 
     def _check_lockstep(self) -> None:

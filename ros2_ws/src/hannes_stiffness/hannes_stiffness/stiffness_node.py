@@ -14,7 +14,7 @@ from time import monotonic
 
 from hannes_description.errors import HannesError
 from hannes_ros.convert import MOTOR_STATE, JointSample, float64_bytes, float64_value
-from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
+from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health, silence
 from hannes_ros.lockstep import TickJoin
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
@@ -28,6 +28,7 @@ from .classifier import NOT_SURE, StiffnessClassifier, class_label
 from .features import FeatureStream, Sample, believable
 
 _STATE, _CURRENT, _REFERENCE = range(3)
+_NAMES = ("motor/state", "motor/current", "reference_position")
 _INPUTS = ("encoder_position", "motor_current", "reference_position")
 _LONGEST_QUEUE = 4000
 """Messages without a whole tick after which lock-step is joined anew; most currents kept between two states.
@@ -68,7 +69,10 @@ class StiffnessNode(HannesNode, Node):
         self._classifier = StiffnessClassifier.load(self._settings.classifier)
         self._sure = self._settings.sure if self._settings.sure >= 0.0 else self._classifier.least
         self._stream = FeatureStream(self._classifier.spec, self._settings.rate)
-        self._health = Health("not_finite", "unknown_joint", "stale_input", "lost_ticks", "not_sure")
+        self._health = Health(
+            "not_finite", "not_believable", "unknown_joint", "stale_input", "lost_ticks", "not_sure"
+        )
+        self._reported = 0
         self._latest: dict[int, tuple[float, float]] = {}
         self._currents: list[float] = []
         self._join = TickJoin(3, _LONGEST_QUEUE)
@@ -97,20 +101,31 @@ class StiffnessNode(HannesNode, Node):
         value = float64_value(data)
         if self._settings.clock == "lockstep":
             self._tick(slot, value)
-        elif math.isfinite(value):
+        elif self._is_finite(slot, value):
             self._latest[slot] = (value, self._time)
             if slot == _CURRENT and len(self._currents) < _LONGEST_QUEUE:
                 self._currents.append(value)
-        else:
-            self._health.count("not_finite")
+
+    def _is_finite(self, slot: int, value: float) -> bool:
+        """Whether an input is finite; if not it is counted and said."""
+        if math.isfinite(value):
+            self._health.faults.good(f"{_NAMES[slot]}, finite")
+            return True
+        self._health.count("not_finite")
+        self._health.faults.bad(
+            f"{_NAMES[slot]}, finite", ERROR, f"{_NAMES[slot]} is not finite ({value}): no answer"
+        )
+        return False
 
     def _state(self, data: bytes) -> None:
         self._health.last_input = monotonic()
         try:
             sample = MOTOR_STATE.decode(data)
-        except HannesError:
+        except HannesError as error:
             self._health.count("unknown_joint")
+            self._health.faults.bad(_NAMES[_STATE], ERROR, f"motor/state is rejected: {error}")
             return
+        self._health.faults.good(_NAMES[_STATE])
         if self._settings.clock == "lockstep":
             self._follow(sample.stamp_ns)
             self._tick(_STATE, sample)
@@ -162,9 +177,19 @@ class StiffnessNode(HannesNode, Node):
 
     def _classify(self, state: JointSample, current: float, reference: float) -> None:
         encoder = state.position[0]
-        if not believable(current, reference, encoder):
-            self._health.count("not_finite")
+        finite = [self._is_finite(slot, value) for slot, value in enumerate((encoder, current, reference))]
+        if not all(finite):
             return
+        if not believable(current, reference, encoder):
+            self._health.count("not_believable")
+            self._health.faults.bad(
+                "range",
+                ERROR,
+                f"no hand has {current:g} A, a reference of {reference:g} rad and a position of {encoder:g} rad: no "
+                "answer; are they in A and rad?",
+            )
+            return
+        self._health.faults.good("range")
         sample = self._stream.push(state.stamp_ns * 1e-9, current, reference, encoder)
         if sample is None:
             return
@@ -201,9 +226,7 @@ class StiffnessNode(HannesNode, Node):
             return WARN, "waiting for motor/state", values
         if self._settings.clock == "lockstep":
             silent = [
-                name
-                for slot, name in enumerate(("motor/state", "motor/current", "reference_position"))
-                if slot in self._join.missing() and self._queued > 10
+                name for slot, name in enumerate(_NAMES) if slot in self._join.missing() and self._queued > 10
             ]
         else:
             silent = [
@@ -211,7 +234,14 @@ class StiffnessNode(HannesNode, Node):
                 for slot, name in ((_CURRENT, "motor/current"), (_REFERENCE, "reference_position"))
                 if slot not in self._latest or self._time - self._latest[slot][1] > self._settings.timeout
             ]
-        return (WARN, f"no {' and no '.join(silent)}", values) if silent else (OK, "classifying", values)
+        answered, self._reported = self._health.cycles > self._reported, self._health.cycles
+        if silent:
+            return WARN, f"no {' and no '.join(silent)}", values
+        if not answered and silence({_NAMES[_STATE]: self._health.last_input}) is None:
+            counts = {**self._health.counts, "out_of_order": self._stream.rejected}
+            why = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+            return WARN, f"no answer to motor/state{f' ({why})' if why else ''}", values
+        return OK, "classifying", values
 
 
 def main() -> None:

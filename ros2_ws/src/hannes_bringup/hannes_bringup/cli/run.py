@@ -97,6 +97,8 @@ def _check_files(given: Mapping[str, str]) -> None:
         raise HannesError(
             f"No EMG recording '{given['emg']}': give the path of a .csv file, or none for synthetic EMG."
         )
+    if given.get("config") and not os.path.isfile(given["config"]):
+        raise HannesError(f"No parameter file '{given['config']}': give the path of a .yaml file.")
 
 
 def _absolute(name_or_path: str) -> str:
