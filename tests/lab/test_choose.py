@@ -1,16 +1,18 @@
 """Which of the sets of one size is taken, on made-up costs."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from hannes_description.errors import HannesError
 from hannes_lab import choose as module
 from hannes_lab import wording
 from hannes_lab.chance import Chance
 from hannes_lab.choose import OWN_ERROR_PART, Choice, _thoroughly, choose, choose_greedily
-from hannes_lab.diagnose import _behind_the_law
+from hannes_lab.diagnose import _behind_the_law, effect_sources
 from hannes_lab.search import PENALTY, Candidate
 from hannes_lab.wording import lead, nearest_sentence
 
@@ -216,3 +218,10 @@ def test_what_would_come_next_is_told_where_much_is_left(
     if said:
         assert "motor_voltage of 'fast' is still missed by 5.2 times" in notes[0]
         assert "is b, by 15 (chance: 20, and " in notes[0] and "--effect a --effect b" in notes[0]
+
+
+def test_an_effect_of_ones_own_may_be_among_those_that_alone_take_part() -> None:
+    own = f"{Path(__file__).parent / 'outside_effect.py'}:Worn"
+    assert effect_sources([own], only=["worn", "cogging"]) == {"cogging": "cogging", "worn": own}
+    with pytest.raises(HannesError, match="worn"):
+        effect_sources(only=["worn"])

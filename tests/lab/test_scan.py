@@ -1,5 +1,6 @@
 """What a scan of the strengths and shapes of an effect hands to the fits, and which of these are carried on."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -7,13 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 from hannes_description.model import Model
-from hannes_lab.diagnose import effect_sources
+from hannes_lab.diagnose import _idle_at_the_end, effect_sources
+from hannes_lab.diagnosis import Fall
 from hannes_lab.fit import Fit
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.scan import _distinct, _Place, _strengths
 from hannes_lab.search import FAR, Candidate, Search
-from hannes_lab.trials import make_trial
+from hannes_lab.spectrum import resolved
+from hannes_lab.trials import Closure, Trial, make_trial
 from hannes_sim.effect import load_effect
 
 
@@ -89,3 +92,45 @@ def test_a_parameter_that_went_to_nought_is_stepped_where_numbers_are() -> None:
     place = _Place(search.scan, kind, found, model, coordinates)
     with np.errstate(all="raise"):
         place.swapped({}, f"{name}.viscous")
+
+
+def test_a_ripple_that_passes_faster_than_it_is_sampled_is_not_tried() -> None:
+    """Its alias is any slow curve: what a wrong model leaves, too."""
+    ticks = np.arange(0.0, 4.0, 0.001)
+    time = np.arange(0.0, 4.0, 0.02)
+
+    def ramp(at: np.ndarray, speed: float) -> np.ndarray:
+        return speed * np.minimum(at, 2.0)
+
+    def trial(name: str, speed: float) -> Trial:
+        signals = {"encoder_position": (time, ramp(time, speed))}
+        return Trial(name, 0.001, ramp(ticks, speed), signals, (Closure(0.0, 3.9, name),))
+
+    def features(*trials: Trial) -> Any:
+        return SimpleNamespace(trials=trials)
+
+    fast, slow = trial("fast", 10.0), trial("slow", 2.0)
+    assert resolved(features(fast)) == pytest.approx(2 * 10.0 * 0.02, rel=1e-6)
+    assert resolved(features(fast, slow)) == pytest.approx(2 * 2.0 * 0.02, rel=1e-6)
+    alone = replace(fast, signals={"motor_current": fast.signals["encoder_position"]})
+    assert resolved(features(alone)) == 0.0
+
+
+def test_an_effect_with_which_conditions_are_foretold_worse_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It joined by a quick look; the whole fits say another thing."""
+    monkeypatch.setattr("hannes_lab.diagnose._may_be_nought", lambda *_: False)
+    monkeypatch.setattr("hannes_lab.diagnose.led_off", lambda *_: "")
+    features = SimpleNamespace(repeated=False, closures_of={"a": 1, "b": 1}, conditions=("a", "b"))
+    search: Any = SimpleNamespace(problem=SimpleNamespace(features=features), fit_of=lambda names: None)
+    found: Any = SimpleNamespace(names=("coulomb_friction", "cogging"))
+
+    def falls(*errors: float) -> list[Fall]:
+        return [Fall("", math.nan, math.nan, {}, (), {"encoder_position": error}) for error in errors]
+
+    def why(last: float) -> str:
+        return _idle_at_the_end(search, found, None, falls(0.1, 0.05, 0.016, last), False)  # type: ignore[arg-type]
+
+    assert why(0.021) == (
+        "the error on held-out conditions rises with it from 0.32 to 0.42 times the fitted nominal model's"
+    )
+    assert why(0.015) == ""

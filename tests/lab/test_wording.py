@@ -36,6 +36,9 @@ def test_a_condition_that_is_alone_in_its_direction_is_told() -> None:
     assert not _one_way([trial, second]), "each direction has another"
     both = replace(trial, closures=(Closure(0.005, 1.995, "lap"), Closure(2.005, 2.995, "up")))
     assert not _one_way([both]), "a lap goes both ways"
+    up = replace(trial, closures=tuple(closure for closure in closures if closure.condition == "up"))
+    (said,) = _one_way([up])
+    assert said.startswith("every condition goes the same way")
 
 
 def test_a_tolerance_of_what_moves_nothing_is_no_result() -> None:

@@ -86,7 +86,8 @@ def effect_sources(
 
     Two different effects of one name are a HannesError: results could not say which one they mean.
     """
-    names = list(only) if only is not None else list(catalogue())
+    own = {load_effect(given).name for given in extra}
+    names = [name for name in only if name not in own] if only is not None else list(catalogue())
     out: dict[str, str] = {}
     for given in (*names, *extra):
         kind = load_effect(given)
@@ -356,8 +357,10 @@ def _idle_at_the_end(
     if len(found.names) > 1 and (why := led_off(search.fit_of(found.names[:-1]), found, found.names[-1:])):
         return why
     before, after = deciding_errors(falls)[-2:]
+    unit = " times the repeatability" if search.problem.features.repeated else OF_NOMINAL
+    if after > before:
+        return f"the error on held-out conditions rises with it from {before:.3g} to {after:.3g}{unit}"
     if alone and after**2 > (1.0 - EACH_TAKES) * before**2:
-        unit = " times the repeatability" if search.problem.features.repeated else OF_NOMINAL
         return (
             f"the error on held-out conditions changes with it from {before:.3g} to {after:.3g}{unit} only; its mean "
             f"square must fall by {100 * EACH_TAKES:.0f} %"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .fit import Fit, finite_differences, linear_minimum, prior_weights
 from .problem import Coordinate, Problem, effect_coordinates
 from .settle import seen_from
-from .spectrum import periods_of_a_turn, position_periods, whole_periods
+from .spectrum import periods_of_a_turn, position_periods, resolved, whole_periods
 from .surrogate import AnchoredRig
 
 Array = NDArray[np.float64]
@@ -300,8 +300,9 @@ def tried_periods(kind: EffectType, problem: Problem, base: Fit, every: int = 1)
     p = period_of(kind)
     if p is None:
         return ()
-    along = whole_periods(problem.features, p.lower, p.upper)[every - 1 :: every]
-    return (*along, *periods_of_a_turn(problem, base, p.lower, p.upper))
+    lower = max(p.lower, resolved(problem.features))
+    along = whole_periods(problem.features, lower, p.upper)[every - 1 :: every]
+    return (*along, *periods_of_a_turn(problem, base, lower, p.upper))
 
 
 def spectral_periods(kind: EffectType, problem: Problem, base: Fit) -> tuple[float, ...]:

@@ -31,6 +31,9 @@ WAVES = tuple(0.5 * k for k in range(1, 81))
 with friction and a controller around it shows few of them as lines."""
 
 
+MOVES = 0.1
+"""Part of its greatest speed from which a machine counts as moving."""
+
 TURN_WAVES = range(1, 81)
 """Waves within a turn whose ripple is simulated: whole ones, for else turns would not repeat."""
 
@@ -42,6 +45,31 @@ ALIKE = 0.02
 
 FARTHER = 1.5
 """... and the machine goes so many times as far as its reference does."""
+
+
+def resolved(features: Features) -> float:
+    """Shortest period [unit of the position] of which a recording has two samples a wave where it goes at its middle
+    speed, in the condition that goes slowest; 0 where no position is recorded.
+
+    Of what passes faster a simulation that is sampled alike makes any slow curve (an alias), and so does a model that
+    is wrong otherwise.
+    """
+    out = []
+    for trial in features.trials:
+        if "encoder_position" not in trial.signals:
+            continue
+        time, place = trial.signals["encoder_position"]
+        step = min(float(np.median(np.diff(t))) for t, _ in trial.signals.values() if t.size > 1)
+        for condition in trial.conditions:
+            ways = [
+                np.abs(np.diff(np.interp(np.arange(c.start, c.stop, step), time, place)))
+                for c in trial.of(condition)
+            ]
+            way = np.concatenate(ways)
+            moving = way[way > MOVES * float(way.max(initial=0.0))]
+            if moving.size:
+                out.append(2.0 * float(np.median(moving)))
+    return min(out, default=0.0)
 
 
 def whole_periods(features: Features, lower: float, upper: float) -> tuple[float, ...]:

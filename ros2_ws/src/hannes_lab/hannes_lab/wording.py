@@ -188,8 +188,13 @@ def _one_way(trials: Sequence[Trial]) -> list[str]:
             curve = np.median(curves_of(trial.of(condition), time, place), axis=0)
             net = float(curve[-1] - curve[0])
             ways[condition] = float(np.sign(net)) if abs(net) > ONE_WAY * float(np.ptp(curve)) else 0.0
-    if 0.0 in ways.values() or len(set(ways.values())) < 2:
+    if 0.0 in ways.values():
         return []
+    if len(set(ways.values())) == 1:
+        return [
+            "every condition goes the same way: a constant force, Coulomb friction and one that depends on the "
+            "direction are the same thing here; record a move back"
+        ]
     alone = [name for name, way in ways.items() if list(ways.values()).count(way) == 1]
     return [
         f"'{name}' is the only condition that goes its way: what acts in that direction alone is not foretold from the "
