@@ -27,7 +27,7 @@ demo: setup ## a closure recorded, compared, diagnosed; ends with the path of a 
 test: setup ## all tests
 	@$(BIN)/python -m pytest $(PYTEST_FLAGS) $(TESTS)
 
-quick: setup ## the tests without those that take more than about twenty seconds each
+quick: setup ## the tests without those that take more than about twelve seconds each
 	@$(BIN)/python -m pytest $(PYTEST_FLAGS) -m "not slow" $(TESTS)
 
 check: setup ## ruff (rules and layout) and mypy

@@ -476,6 +476,7 @@ def test_a_bag_is_not_played_where_another_node_publishes(start: Start, tmp_path
         assert "played " in end(start("player", bag=bag, subscribers=1, wait=PATIENCE, **wanted))
 
 
+@pytest.mark.slow
 def test_a_hand_in_lockstep_gets_every_command_of_a_bag_however_fast_it_is_played(
     start: Start, tmp_path: Path, ros_context: Any
 ) -> None:

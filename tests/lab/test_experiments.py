@@ -43,6 +43,7 @@ def undescribed() -> Prepared:
     return prepare([replace(t, options={"object": t.options["object"]}) for t in trials], Model.load())
 
 
+@pytest.mark.slow
 def test_nothing_recorded_in_operation_tells_slack_from_an_encoder_offset(
     undescribed: Prepared, executor: Executor
 ) -> None:

@@ -57,6 +57,7 @@ def test_all_signals_of_recordings_that_describe_nothing_leave_it_to_the_clock_t
     assert all("moved" in t.options for t in with_one_clock(late(trials, both), Model.load()))
 
 
+@pytest.mark.slow
 def test_a_signal_that_is_a_little_late_in_recordings_that_describe_nothing_is_fitted(
     trials: list[Trial],
 ) -> None:

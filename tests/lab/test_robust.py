@@ -281,6 +281,7 @@ def test_stamps_of_another_clock(
     assert float(out.split("Overall error: ")[1].split()[0]) < 5.0
 
 
+@pytest.mark.slow
 def test_different_rates_and_storages_in_one_set(
     good: dict[str, Signals],
     tmp_path: Path,

@@ -93,6 +93,7 @@ def test_closures_on_nothing_and_on_an_object_in_one_bag_are_two_recordings(tmp_
     assert [t.options.get("object") for t in said] == [None, "rigid"]
 
 
+@pytest.mark.slow
 def test_a_strange_hand_lacks_nothing(tmp_path: Path) -> None:
     found = diagnosed(strange_set(tmp_path))
     assert found.verdict == "nothing"
@@ -100,6 +101,7 @@ def test_a_strange_hand_lacks_nothing(tmp_path: Path) -> None:
     assert any(note.startswith("grasp_fast: fitted too") and "N.m/rad" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_strange_hand_may_rest_off_its_open_stop(tmp_path: Path) -> None:
     """The controller sees the encoder only: where that reads too little, the wire is wound up by as much."""
     two = ("fast", "grasp_fast")

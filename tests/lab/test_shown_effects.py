@@ -122,6 +122,7 @@ def test_a_torque_constant_that_is_far_too_low_points_at_the_bridge(
     assert [("coasting_bridge.py" in note and "(0.858 N.m/A)" in note) for note in said] == [True] * told
 
 
+@pytest.mark.slow
 def test_what_swings_is_unknown_and_its_frequency_is_said(prepared: Prepared, executor: Executor) -> None:
     only = ["coulomb_friction", "cogging", "command_delay", "gearbox_inertia"]
     found = diagnose(prepared, effect_sources(only=only, model=prepared.model), executor=executor)

@@ -34,6 +34,7 @@ def hannes(*words: str, env: dict[str, str]) -> str:
     return " ".join(told.stdout.split())
 
 
+@pytest.mark.slow
 def test_what_the_graph_recorded_is_compared_as_its_own(
     tmp_path: Path, ros_environment: dict[str, str]
 ) -> None:

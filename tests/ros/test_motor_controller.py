@@ -353,6 +353,7 @@ def test_a_waiting_controller_is_a_warning_however_late_its_loop(peer):
         assert {(s.level[0], s.message) for s in peer.diagnostics} == {(1, waiting)}
 
 
+@pytest.mark.slow
 def test_a_profile_of_its_own_waits_for_the_hand(peer):
     peer.hear("motor_voltage", "reference_position")
     peer.hear_diagnostics()

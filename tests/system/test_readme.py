@@ -119,6 +119,7 @@ def test_graph_with_the_found_model(found: tuple[Path, str], ros_environment: di
     assert "/hannes/motor/state" in printed and "Overall error" in printed
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_what_is_recorded_as_printed_is_compared(tmp_path: Path, ros_environment: dict[str, str]) -> None:
     """Two closures of the second speed; again where a busy machine lets the controller pause, which switches it off."""
