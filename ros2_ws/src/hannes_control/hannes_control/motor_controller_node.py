@@ -22,10 +22,10 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.publisher import Publisher
 
 from .double_pid import DoublePID
-from .lockstep_control import LockstepControl
-from .motor_drive import MotorDrive
-from .motor_inputs import MotorInputs
-from .realtime_control import RealtimeControl
+from .nodes.lockstep_control import LockstepControl
+from .nodes.motor_drive import MotorDrive
+from .nodes.motor_inputs import MotorInputs
+from .nodes.realtime_control import RealtimeControl
 from .reference import FULL_CLOSURE, PROFILES, Profile, check_travel, make_profile
 
 _CHECK_S = 0.02

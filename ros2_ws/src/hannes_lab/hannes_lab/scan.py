@@ -300,7 +300,8 @@ def tried_periods(kind: EffectType, problem: Problem, base: Fit, every: int = 1)
     p = period_of(kind)
     if p is None:
         return ()
-    lower = max(p.lower, resolved(problem.features))
+    # Where the model has the machine's form, what is sampled too slowly is simulated so, too.
+    lower = max(p.lower, resolved(problem.features)) if problem.rig.foreign else p.lower
     along = whole_periods(problem.features, lower, p.upper)[every - 1 :: every]
     return (*along, *periods_of_a_turn(problem, base, lower, p.upper))
 

@@ -8,9 +8,9 @@ from hannes_description.errors import HannesError
 from hannes_ros import convert
 from hannes_ros.diagnostics import Health
 
-from .double_pid import DoublePID
+from ..double_pid import DoublePID
+from ..reference import Profile
 from .motor_inputs import MotorInputs
-from .reference import Profile
 
 Send = Callable[[bytes], None]
 ZERO = convert.float64_bytes(0.0)

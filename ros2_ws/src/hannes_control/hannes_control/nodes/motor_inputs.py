@@ -11,7 +11,7 @@ from hannes_description.parameters import ParameterSet
 from hannes_ros import convert
 from hannes_ros.diagnostics import ERROR, WARN, Health
 
-from .reference import travel_of
+from ..reference import travel_of
 
 _STALLED = 3.0
 """Multiples of the current of the stalled motor above which a reading is none: driven backwards at full speed it draws
