@@ -574,3 +574,19 @@ def test_a_topic_of_a_type_that_is_not_installed_is_left_out(start: Start, tmp_p
     assert "played 20 messages" in output
     told = refused(start("player", bag=str(bag), topics=["/thing"]))
     assert "/thing: The message type 'my_pkg/msg/Thing' is not installed here. Install" in told
+
+
+def test_a_bags_own_clock_is_played_at_its_own_pace(start: Start, tmp_path: Path) -> None:
+    """The player is no hand in lock-step, though it tells the time and plays the state; and time does not go back."""
+    stamps = np.arange(1, 5001, dtype=np.int64) * 1_000_000
+    messages = motor_messages(stamps)
+    volts = list(zip(stamps.tolist(), cdr.encode_float64(np.ones(5000)), strict=True))
+    messages["/hannes/motor/voltage"] = (cdr.FLOAT64, volts)
+    messages["/clock"] = ("rosgraph_msgs/msg/Clock", [(1_000_000, cdr.encode_clock(stamps[:1])[0])])
+    bag, names = (
+        str(foreign_bag(tmp_path / "bag", messages)),
+        ["/clock", "/hannes/motor/state", "/hannes/motor/voltage"],
+    )
+    assert "played 10001 messages" in end(start("player", bag=bag, topics=names, clock=False, wait=0.1))
+    told = refused(start("player", bag=bag, topics=names, clock=False, loop=True))
+    assert "/clock cannot be played in a loop" in told

@@ -512,3 +512,22 @@ def test_times_of_a_slow_clock_are_spread(tmp_path: Path) -> None:
     assert step == 0 and times.tolist() == [5, 5, 5]
     times, step = spread(np.array([0, 0, 10, 10, 10, 10, 90, 90]))
     assert step == 45 and times.tolist() == [0, 5, 10, 21, 32, 43, 90, 112]
+
+
+def test_messages_that_stand_twice_are_no_slow_clock(tmp_path: Path) -> None:
+    """Two recorders in one bag: each message again, stamp and all."""
+    stamps = np.repeat(np.arange(0, 500, dtype=np.int64) * 1_000_000, 2)
+    bag = foreign_bag(tmp_path / "bag", motor_messages(stamps))
+    with pytest.warns(RecordingWarning, match="repeat the one before, its stamp too, were left out: 500 on"):
+        found = read_bag(bag)
+    assert found["motor_current"].time.size == found["encoder_position"].time.size == 500
+
+
+def test_what_comes_oftener_than_the_ticks_of_a_lockstep_is_no_slow_clock(tmp_path: Path) -> None:
+    """EMG of 300 Hz beside ticks of 10 ms: three samples of one time each."""
+    stamps = np.arange(0, 200, dtype=np.int64) * 10_000_000
+    messages = motor_messages(stamps)
+    emg = list(zip(np.repeat(stamps, 3).tolist(), cdr.encode_float64(np.sin(np.arange(600.0))), strict=True))
+    messages["/hannes/emg/flexor"] = (cdr.FLOAT64, emg)
+    found = read_bag(foreign_bag(tmp_path / "bag", messages))
+    assert not any("slow /clock" in warning for warning in found.warnings)

@@ -168,3 +168,8 @@ def test_not_finite_sample_is_refused():
         EmgIntegrator().update(float("nan"), 0.0)
     with pytest.raises(HannesError, match="extensor EMG is not finite at sample 1"):
         emg_reference(np.zeros(3), np.array([0.0, np.inf, 0.0]))
+
+
+def test_more_synthetic_emg_than_memory_holds_is_refused() -> None:
+    with pytest.raises(HannesError, match=r"1.2e\+08 samples at 300 Hz; at most 100000000 are made"):
+        synthesise(SyntheticEmg(closures=80_000, close=1.6, hold=1.0, open=1.6, rest=0.8))

@@ -74,7 +74,9 @@ def test_an_object_may_be_known_well() -> None:
     assert mine["object.position@grasp"] == usual["object.position@grasp"], "the encoder shows it"
     undamped = priors(Model.load(), "grasp", object={**data, "damping": 0.0})
     assert "object.stiffness@grasp" in undamped and "object.damping@grasp" not in undamped
-    with pytest.raises(HannesError, match=r"tolerance is -0\.1; it must be a number above 0"):
+    exactly = priors(Model.load(), "grasp", object={**data, "tolerance": 0.0})
+    assert [name for name in exactly if name.startswith("object.")] == ["object.position@grasp"]
+    with pytest.raises(HannesError, match=r"tolerance is -0\.1; it must be 0 \(known\) or more"):
         priors(Model.load(), "grasp", object={**data, "tolerance": -0.1})
 
 

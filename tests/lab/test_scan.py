@@ -13,7 +13,7 @@ from hannes_lab.diagnosis import Fall
 from hannes_lab.fit import Fit
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
-from hannes_lab.scan import _distinct, _Place, _strengths
+from hannes_lab.scan import _distinct, _Place, _strengths, tried_periods
 from hannes_lab.search import FAR, Candidate, Search
 from hannes_lab.spectrum import resolved
 from hannes_lab.trials import Closure, Trial, make_trial
@@ -114,6 +114,25 @@ def test_a_ripple_that_passes_faster_than_it_is_sampled_is_not_tried() -> None:
     assert resolved(features(fast, slow)) == pytest.approx(2 * 2.0 * 0.02, rel=1e-6)
     alone = replace(fast, signals={"motor_current": fast.signals["encoder_position"]})
     assert resolved(features(alone)) == 0.0
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(time.size)
+    held = replace(slow, name="held", signals={"encoder_position": (time, noise)})
+    assert resolved(features(fast, held)) == resolved(features(fast)), "it goes nowhere"
+    short = replace(fast, signals={"encoder_position": (time[:1], time[:1])})
+    assert resolved(features(short)) == 0.0
+
+    blocks = (SimpleNamespace(signal="encoder_position", measured=ramp(ticks, 10.0)),)
+    kind, base = (
+        load_effect("cogging"),
+        Fit(Model.load(), (), np.zeros(0), 0.0, np.zeros(1), np.zeros((1, 0))),
+    )
+
+    def tried(foreign: bool) -> float:
+        problem: Any = SimpleNamespace(
+            features=SimpleNamespace(trials=(fast,), blocks=blocks), rig=SimpleNamespace(foreign=foreign)
+        )
+        return min(tried_periods(kind, problem, base))
+
+    assert tried(True) >= 0.4 and tried(False) == pytest.approx(0.5)
 
 
 def test_an_effect_with_which_conditions_are_foretold_worse_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,4 +152,4 @@ def test_an_effect_with_which_conditions_are_foretold_worse_is_none(monkeypatch:
     assert why(0.021) == (
         "the error on held-out conditions rises with it from 0.32 to 0.42 times the fitted nominal model's"
     )
-    assert why(0.015) == ""
+    assert why(0.015) == "" and why(0.01601) == ""

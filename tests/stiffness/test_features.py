@@ -246,3 +246,14 @@ def test_a_ripple_of_the_reference_is_no_new_closure_and_a_new_closure_forgets()
     starts = t[np.flatnonzero(np.diff(batch.void.astype(int)) == 1) + 1]
     assert len(starts[starts > 0.5]) == 1
     assert 6.0 < starts[-1] < 6.2
+
+
+def test_a_stream_takes_whole_numbers() -> None:
+    """A reference of 5 rad is one, whoever writes it without a point."""
+    streams = [FeatureStream(FeatureSpec(version=WINDOW)) for _ in range(2)]
+    for k in range(30):
+        a, b = (
+            stream.push(0.04 * k, *values)
+            for stream, values in zip(streams, ((1, 5, 1), (1.0, 5.0, 1.0)), strict=True)
+        )
+        assert a == b

@@ -41,6 +41,15 @@ class Playlist:
         """s"""
         return float(self.log_ns[-1] - self.log_ns[0]) * 1e-9
 
+    def without(self, names: Collection[str]) -> Playlist:
+        """The same less some topics; it begins when it did."""
+        kept = [k for k, (topic, _) in enumerate(self.entries) if topic not in names]
+        return Playlist(
+            tuple(entry for entry in self.topics if entry.name not in names),
+            self.log_ns[kept],
+            tuple(self.entries[k] for k in kept),
+        )
+
     def ticks(self) -> Iterator[tuple[int, tuple[tuple[str, bytes], ...]]]:
         """(log time ns, messages) for each distinct log time."""
         starts = np.flatnonzero(np.concatenate([[True], np.diff(self.log_ns) > 0]))

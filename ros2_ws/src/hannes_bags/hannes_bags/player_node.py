@@ -84,7 +84,13 @@ class PlayerNode(HannesNode, Node):
         self._topics = playlist.topics
         # A hand in lock-step takes one command for each tick, and tells the time.
         self._voltage = self.resolve_topic_name(topics.signal("motor_voltage").topic)
-        self._follows = not p.clock and self._voltage in {entry.name for entry in playlist.topics}
+        played = {entry.name for entry in playlist.topics}
+        if p.loop and topics.CLOCK_TOPIC in played:
+            raise HannesError(
+                f"A bag's own {topics.CLOCK_TOPIC} cannot be played in a loop: time would go back at each round. Leave "
+                "it out, and let the player tell the time (clock:=true)."
+            )
+        self._follows = not p.clock and self._voltage in played and topics.CLOCK_TOPIC not in played
         self._in_step = False
         self._sent = self._answered = 0
         self._rebased_at = -1
@@ -115,13 +121,13 @@ class PlayerNode(HannesNode, Node):
         if not missing:
             return playlist
         said = "; ".join(f"{topic}: {why}" for topic, why in missing.items())
-        left = [entry.name for entry in playlist.topics if entry.name not in missing]
-        if self._p.topics or not left:
+        left = playlist.without(missing)
+        if self._p.topics or not left.entries:
             raise HannesError(
                 f"{said} Install the package of the type, or name other topics (--topic of hannes play)."
             )
         self.get_logger().warning(f"left out: {said}")
-        return load_playlist(self._p.bag, topics=left, start=self._p.start)
+        return left
 
     def _open(self) -> None:
         """Announce what is to be played."""
@@ -248,7 +254,8 @@ class PlayerNode(HannesNode, Node):
         """Whether somebody else publishes what is to be played; the node ends then."""
         others = {} if self._p.beside else self._others()
         if others:
-            clock = " (clock:=false leaves /clock out)" if topics.CLOCK_TOPIC in others else ""
+            own_time = self._p.clock and topics.CLOCK_TOPIC in others
+            clock = " (clock:=false leaves /clock out)" if own_time else ""
             self.fail(
                 f"Another node publishes what is to be played: {_listed(others)}. Stop it, name the topics to play "
                 f"(--topic of hannes play){clock}, or give --beside (beside:=true) to play all the same."

@@ -205,6 +205,7 @@ class _Reader:
         self.repeats: dict[str, int] = {}
         self.log_ns: dict[str, IntArray] = {}
         self.coarse: dict[str, int] = {}
+        self.slow_clock = False
 
     def recording(self, sha256: str) -> Recording:
         chosen = self._choose()
@@ -222,6 +223,7 @@ class _Reader:
         states = {
             topic: self._decode(topic, cdr.decode_joint_states) for topic in encoder_first if self._is(topic)
         }
+        self.slow_clock = self._has_slow_clock(states)
         relation = self._relation(states)
         samples: dict[str, tuple[IntArray, npt.NDArray[Any]]] = {}
         for topic, signals in carried.items():
@@ -326,11 +328,24 @@ class _Reader:
 
     def _log_ns(self, topic: str) -> IntArray:
         """Log times of a topic's messages; those of a slow /clock are spread."""
+        times = np.frombuffer(self.raw[topic].log_ns, dtype=np.int64)
+        if not self.slow_clock:
+            return times
         if topic not in self.log_ns:
-            self.log_ns[topic], step = spread(np.frombuffer(self.raw[topic].log_ns, dtype=np.int64))
+            self.log_ns[topic], step = spread(times)
             if step:
                 self.coarse[topic] = step
         return self.log_ns[topic]
+
+    def _has_slow_clock(self, states: Mapping[str, list[cdr.JointStates]]) -> bool:
+        """Whether what is stamped was logged in steps that its stamps do not have; without stamps, whether any was."""
+        for topic, blocks in states.items():
+            stamps = np.sort(np.concatenate([block.stamp_ns for block in blocks]))
+            if stamps.any():
+                times = np.frombuffer(self.raw[topic].log_ns, dtype=np.int64)
+                doubled = stamps.size > 1 and np.median(np.diff(stamps)) == 0
+                return bool(spread(times)[1]) and not doubled
+        return True
 
     def _stamped(self, topic: str, blocks: list[cdr.JointStates]) -> tuple[IntArray, IntArray] | None:
         """(stamps, log times) in the order of the topic; None if its publisher does not stamp."""

@@ -183,8 +183,9 @@ class RecorderNode(HannesNode, Node):
         if self._simulated and self._times.went_back > self._said_back:
             self._said_back = self._times.went_back
             self.get_logger().error(
-                f"{self._clock} went back: another run has begun, or a player loops. This bag holds both and cannot be "
-                "read as one; record each run into a bag of its own"
+                f"{self._clock} went back: another run has begun, a player loops, or two nodes tell the time. This bag "
+                "cannot be read as one; record each run into a bag of its own",
+                throttle_duration_sec=_ELSEWHERE_S,
             )
         if self._simulated and self._decided:
             self._clocks.several()

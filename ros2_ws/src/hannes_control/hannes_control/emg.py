@@ -23,7 +23,7 @@ from hannes_description.errors import HannesError
 from numpy.typing import NDArray
 from scipy import signal
 
-from .reference import FULL_CLOSURE
+from .reference import FULL_CLOSURE, MOST
 
 Array = NDArray[np.float64]
 
@@ -288,8 +288,13 @@ def synthesise(protocol: SyntheticEmg, seed: int, rate: int = 300) -> EmgRecordi
         ]
         if protocol.cocontraction > 0.0:
             steps += [(protocol.cocontraction, 1.0, 1.0), (protocol.rest, 0.0, 0.0)]
-    rng = np.random.default_rng(seed)
     counts = [round(duration * rate) for duration, _, _ in steps]
+    if sum(counts) > MOST:
+        raise HannesError(
+            f"Synthetic EMG of {protocol.closures} closures takes {sum(counts):.3g} samples at {rate} Hz; at most "
+            f"{MOST} are made: ask for fewer or shorter ones."
+        )
+    rng = np.random.default_rng(seed)
     band = signal.butter(4, (20.0, 0.45 * rate), btype="bandpass", fs=rate, output="sos")
     ramp = np.hanning(max(3, round(0.1 * rate)) + 2)[1:-1]
     lead = rate  # the filter's transient is cut off

@@ -40,7 +40,7 @@ class EmgSourceParameters:
         "when the samples begin in real time: at_once, or driven: with the first motor/voltage, rest (0 V) before it",
         choices=("at_once", "driven"),
     )
-    closures: int = parameter(1, "closures of the synthetic EMG", lower=1, upper=10000)
+    closures: int = parameter(1, "closures of the synthetic EMG", lower=1, upper=100000)
     close_time: float = parameter(1.6, "contraction of the flexor", lower=0.1, upper=100.0, unit="s")
     hold_time: float = parameter(1.0, "rest between closing and opening", lower=0.0, upper=100.0, unit="s")
     open_time: float = parameter(1.6, "contraction of the extensor", lower=0.1, upper=100.0, unit="s")

@@ -24,12 +24,11 @@ from rclpy.publisher import Publisher
 from .double_pid import DoublePID
 from .nodes.lockstep_control import LockstepControl
 from .nodes.motor_drive import MotorDrive
-from .nodes.motor_inputs import MotorInputs
+from .nodes.motor_inputs import INPUTS, MotorInputs
 from .nodes.realtime_control import RealtimeControl
 from .reference import FULL_CLOSURE, PROFILES, Profile, check_travel, make_profile
 
 _CHECK_S = 0.02
-_INPUTS = ("encoder_position", "motor_current", "reference_position")
 
 
 @dataclass(frozen=True)
@@ -119,7 +118,7 @@ class MotorController(HannesNode, LifecycleNode):
             "rejoins",
         )
         self._inputs = MotorInputs(model.parameters, self._health)
-        heard = _INPUTS if profile is None else _INPUTS[:2]
+        heard = INPUTS if profile is None else INPUTS[:2]
         self._sources = Sources(self, *heard)
         voltage = topics.publisher(self, "motor_voltage")
         shown = None if profile is None else topics.publisher(self, "reference_position")

@@ -17,8 +17,8 @@ FULL_CLOSURE = 40000 * RAD_PER_COUNT
 Profile = NDArray[np.float64]
 
 
-MOST = 20_000_000
-"""Samples of a profile: five hours at 1 kHz, 160 MB."""
+MOST = 100_000_000
+"""Samples of a profile or of synthetic EMG: a day at 1 kHz, 800 MB, and a few times that while they are made."""
 
 
 def _check(*, closures: float, period: float, dt: float, **more: float) -> None:

@@ -74,7 +74,7 @@ class Parameter:
         """
         return replace(
             self,
-            tolerance=self.tolerance if value > 0.0 else None,
+            tolerance=None if self.tolerance and value <= 0.0 else self.tolerance,
             value=float(value),
             lower=min(self.lower, float(value)),
             upper=max(self.upper, float(value)),

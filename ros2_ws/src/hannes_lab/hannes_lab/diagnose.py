@@ -74,6 +74,9 @@ rest explains all and no model has the machine's form.  A wrong one bends the fi
 FEW_CONDITIONS = 3
 """Of so many one that is left out opens most intervals."""
 
+RISES = 0.01
+"""Part by which the error on conditions that were left out rises where it does: where two fits end differs by less."""
+
 NEEDED = 2.0
 """So many times the error with an effect, or what chance makes of it, without it on closures and on conditions that
 were left out: then it is named also where its intervals hold nought."""
@@ -86,7 +89,7 @@ def effect_sources(
 
     Two different effects of one name are a HannesError: results could not say which one they mean.
     """
-    own = {load_effect(given).name for given in extra}
+    own = {load_effect(given).name for given in extra} - catalogue().keys()
     names = [name for name in only if name not in own] if only is not None else list(catalogue())
     out: dict[str, str] = {}
     for given in (*names, *extra):
@@ -358,7 +361,7 @@ def _idle_at_the_end(
         return why
     before, after = deciding_errors(falls)[-2:]
     unit = " times the repeatability" if search.problem.features.repeated else OF_NOMINAL
-    if after > before:
+    if after > (1.0 + RISES) * before:
         return f"the error on held-out conditions rises with it from {before:.3g} to {after:.3g}{unit}"
     if alone and after**2 > (1.0 - EACH_TAKES) * before**2:
         return (

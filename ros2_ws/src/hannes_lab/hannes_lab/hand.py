@@ -283,7 +283,7 @@ class HandRig(PlantRig):
             sd, scatter, relative = float(entry["hand_sd"]), float(entry["closure_sd"]), entry["unit"] == "1"
             if name in _PER_OBJECT:
                 for trial in self.trials:
-                    out += self._of_object(name, trial, model, Nuisance("", 1.0, sd, relative, scatter))
+                    out += self._of_object(name, trial, model, sd, scatter, relative)
             elif name == _ZERO:
                 if sum(map(is_described, self.trials)) > 1:
                     out.append(Nuisance(HAND_ZERO, 0.0, sd, False, unit="rad"))
@@ -310,22 +310,33 @@ class HandRig(PlantRig):
         """See PlantRig."""
         return name in _GAINS
 
-    def _of_object(self, name: str, trial: Trial, model: Model, usual: Nuisance) -> list[Nuisance]:
-        """Priors of a parameter of a trial's object, if there is one; with its stiffness comes its damping."""
+    def _of_object(
+        self, name: str, trial: Trial, model: Model, sd: float, scatter: float, relative: bool
+    ) -> list[Nuisance]:
+        """Priors of a parameter of a trial's object, if there is one; with its stiffness comes its damping.
+
+        sd, scatter, relative   of an object of this project's plants, from hand to hand and from closure to closure
+        """
         grasp = object_of(trial)
         if grasp is None:
             return []
         plant, _, _ = self._plant(model.without_effects(), trial)
         known = is_of(trial, model) and not trial.options.get("object_seen")
-        told = grasp.tolerance if name == "object.stiffness" else None
-        width = told or (usual.sd if known else _UNKNOWN_OBJECT_SD[name])
+        if name == _PLACE:
+            width, unit = sd if known else _UNKNOWN_OBJECT_SD[name], _OBJECT_UNITS[name]
+            return [
+                Nuisance(f"{name}@{trial.name}", plant.get(name), width, relative, scatter, unit, not known)
+            ]
+        if grasp.tolerance == 0.0:
+            return []
+        told, damping = grasp.tolerance, "object.damping"
         wide = not (known or told)
-        own = replace(usual, name=f"{name}@{trial.name}", mean=plant.get(name), sd=width, wide=wide)
-        out = [replace(own, unit=_OBJECT_UNITS[name])]
-        damping = "object.damping"
-        if name == "object.stiffness" and not known and damping in plant.names and plant.get(damping) > 0.0:
+        width = told or (sd if known else _UNKNOWN_OBJECT_SD[name])
+        stiffness, unit = plant.get(name), _OBJECT_UNITS[name]
+        out = [Nuisance(f"{name}@{trial.name}", stiffness, width, relative, scatter, unit, wide)]
+        if not known and damping in plant.names and plant.get(damping) > 0.0:
             width, unit = told or _UNKNOWN_DAMPING_SD, _OBJECT_UNITS[damping]
-            own = Nuisance(f"{damping}@{trial.name}", plant.get(damping), width, True, 0.0, unit, wide=wide)
+            own = Nuisance(f"{damping}@{trial.name}", plant.get(damping), width, True, 0.0, unit, wide)
             out.append(replace(own, effect="object_damping"))
         return out
 

@@ -289,7 +289,8 @@ class PlantRig:
                 out.append(nuisance)
             elif own.tolerance:
                 scatter = nuisance.closure_sd if nuisance.log else nuisance.closure_sd / own.value
-                out.append(self._within(relative_prior(nuisance.name, own, own.tolerance, scatter), model))
+                told_here = relative_prior(nuisance.name, own, own.tolerance, scatter)
+                out.append(self._within(told_here, model, model.parameters.origin(nuisance.name)))
         for name, own in sorted(told.items()):
             if own.tolerance:
                 if not (name in self._plant(model, self.trials[0])[0].names or self.is_gain(name)):
@@ -297,18 +298,22 @@ class PlantRig:
                         f"{model.parameters.origin(name)}: '{name}' has a tolerance, but no fit can move it on the "
                         f"plant '{model.plant}': take the tolerance out."
                     )
-                out.append(self._within(relative_prior(name, own, own.tolerance), model))
+                where = model.parameters.origin(name)
+                out.append(self._within(relative_prior(name, own, own.tolerance), model, where))
         return out
 
-    def _within(self, nuisance: Nuisance, model: Model) -> Nuisance:
-        """The same, kept inside the bounds that the model's file gives its parameter."""
+    def _within(self, nuisance: Nuisance, model: Model, said_in: str | Path = "") -> Nuisance:
+        """The same, kept inside the bounds that the model's file gives its parameter.
+
+        said_in  the file that says the tolerance, if it is not that of the tolerances
+        """
         if nuisance.name not in model.names:
             return nuisance
         own = model.named(nuisance.name)
         if own.lower >= own.upper:
             raise HannesError(
-                f"{self.population}: '{nuisance.name}' has a tolerance, but its bounds hold it at {own.value:g} "
-                f"{own.unit}: take the line out, or give it lower and upper bounds."
+                f"{said_in or self.population}: '{nuisance.name}' has a tolerance, but its bounds hold it at "
+                f"{own.value:g} {own.unit}: take that out, or give it lower and upper bounds."
             )
         return replace(nuisance, lower=max(nuisance.lower, own.lower), upper=min(nuisance.upper, own.upper))
 

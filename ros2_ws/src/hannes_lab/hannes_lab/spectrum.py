@@ -32,7 +32,7 @@ with friction and a controller around it shows few of them as lines."""
 
 
 MOVES = 0.1
-"""Part of its greatest speed from which a machine counts as moving."""
+"""Part of its greatest speed, and of the farthest way, from which a machine counts as moving."""
 
 TURN_WAVES = range(1, 81)
 """Waves within a turn whose ripple is simulated: whole ones, for else turns would not repeat."""
@@ -52,24 +52,25 @@ def resolved(features: Features) -> float:
     speed, in the condition that goes slowest; 0 where no position is recorded.
 
     Of what passes faster a simulation that is sampled alike makes any slow curve (an alias), and so does a model that
-    is wrong otherwise.
+    is wrong otherwise.  Samples are those of the fastest signal, for a ripple shows in the drive.  Lines of a spectrum
+    have a limit of their own, by the places at which the residual is known (position_periods).
     """
-    out = []
+    out: list[tuple[float, float]] = []
     for trial in features.trials:
-        if "encoder_position" not in trial.signals:
+        steps = [np.diff(time) for time, _ in trial.signals.values()]
+        step = min((float(np.median(d[d > 0.0])) for d in steps if (d > 0.0).any()), default=0.0)
+        if "encoder_position" not in trial.signals or not step:
             continue
         time, place = trial.signals["encoder_position"]
-        step = min(float(np.median(np.diff(t))) for t, _ in trial.signals.values() if t.size > 1)
         for condition in trial.conditions:
-            ways = [
-                np.abs(np.diff(np.interp(np.arange(c.start, c.stop, step), time, place)))
-                for c in trial.of(condition)
-            ]
-            way = np.concatenate(ways)
+            curves = [np.interp(np.arange(c.start, c.stop, step), time, place) for c in trial.of(condition)]
+            way = np.abs(np.concatenate([np.diff(curve) for curve in curves]))
             moving = way[way > MOVES * float(way.max(initial=0.0))]
             if moving.size:
-                out.append(2.0 * float(np.median(moving)))
-    return min(out, default=0.0)
+                out.append((max(float(np.ptp(curve)) for curve in curves), 2.0 * float(np.median(moving))))
+    farthest = max((travel for travel, _ in out), default=0.0)
+    # What is held still moves by its noise alone.
+    return min((shortest for travel, shortest in out if travel > MOVES * farthest), default=0.0)
 
 
 def whole_periods(features: Features, lower: float, upper: float) -> tuple[float, ...]:

@@ -25,8 +25,8 @@ class GraspObject:
     damping    N.s/m
     friction   Coulomb coefficient
     place      m, offset of its centre in the palm frame from the middle of the grasp
-    tolerance  standard deviation of what stiffness and damping may be at the pulley, as a part of them; None where
-               nobody said how well they are known
+    tolerance  standard deviation of what stiffness and damping may be at the pulley, as a part of them; 0: known; None
+               where nobody said how well
     """
 
     shape: str = "capsule"
@@ -48,9 +48,9 @@ class GraspObject:
                 )
         if len(self.place) != 3 or not all(math.isfinite(c) for c in self.place):
             raise HannesError(f"Object place is {self.place}; it must be three finite numbers in m.")
-        if self.tolerance is not None and not (math.isfinite(self.tolerance) and self.tolerance > 0.0):
+        if self.tolerance is not None and not (math.isfinite(self.tolerance) and self.tolerance >= 0.0):
             raise HannesError(
-                f"Object tolerance is {self.tolerance}; it must be a number above 0, a part of stiffness and damping "
+                f"Object tolerance is {self.tolerance}; it must be 0 (known) or more, a part of stiffness and damping "
                 "(0.2: within 20 %)."
             )
 

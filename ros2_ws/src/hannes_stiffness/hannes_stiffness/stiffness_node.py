@@ -29,6 +29,8 @@ from .features import FeatureStream, Sample, believable
 
 _STATE, _CURRENT, _REFERENCE = range(3)
 _NAMES = ("motor/state", "motor/current", "reference_position")
+_PATIENCE_S = 2.0
+"""s without an answer to states that come, from which on that is said."""
 _INPUTS = ("encoder_position", "motor_current", "reference_position")
 _LONGEST_QUEUE = 4000
 """Messages without a whole tick after which lock-step is joined anew; most currents kept between two states.
@@ -72,7 +74,8 @@ class StiffnessNode(HannesNode, Node):
         self._health = Health(
             "not_finite", "not_believable", "unknown_joint", "stale_input", "lost_ticks", "not_sure"
         )
-        self._reported = 0
+        self._answered_at = monotonic()
+        self._counted: dict[str, int] = {}
         self._latest: dict[int, tuple[float, float]] = {}
         self._currents: list[float] = []
         self._join = TickJoin(3, _LONGEST_QUEUE)
@@ -203,6 +206,7 @@ class StiffnessNode(HannesNode, Node):
         if best != 0 and math.isfinite(stiffness[0]):
             self._estimate.publish(Float64MultiArray(data=stiffness))
         self._health.cycles += 1
+        self._answered_at = monotonic()
 
     def _answer(self, sample: Sample) -> tuple[int, list[float], list[float]]:
         """Class, probabilities and stiffness of one sample."""
@@ -234,12 +238,13 @@ class StiffnessNode(HannesNode, Node):
                 for slot, name in ((_CURRENT, "motor/current"), (_REFERENCE, "reference_position"))
                 if slot not in self._latest or self._time - self._latest[slot][1] > self._settings.timeout
             ]
-        answered, self._reported = self._health.cycles > self._reported, self._health.cycles
+        before, self._counted = self._counted, {**self._health.counts, "out_of_order": self._stream.rejected}
         if silent:
             return WARN, f"no {' and no '.join(silent)}", values
-        if not answered and silence({_NAMES[_STATE]: self._health.last_input}) is None:
-            counts = {**self._health.counts, "out_of_order": self._stream.rejected}
-            why = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+        waited = monotonic() - self._answered_at > max(_PATIENCE_S, 3.0 / self._settings.rate)
+        if waited and silence({_NAMES[_STATE]: self._health.last_input}) is None:
+            new = {name: count - before.get(name, 0) for name, count in self._counted.items()}
+            why = ", ".join(f"{name} {count}" for name, count in new.items() if count and name != "not_sure")
             return WARN, f"no answer to motor/state{f' ({why})' if why else ''}", values
         return OK, "classifying", values
 

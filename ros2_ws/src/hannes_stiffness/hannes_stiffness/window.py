@@ -290,6 +290,7 @@ def window_features(s: Any, t: float, i: float, r: float, q: float, mask: float,
 
     t s; i A; r, q rad; mask s. True where the start of a closure makes the sample void.
     """
+    t, i, r, q = float(t), float(i), float(r), float(q)
     _take(s, t, i, r, q)
     m = min(int(s[_COUNT]), SAMPLES)
     mean, extent, slope, reference_velocity, velocity, ratio = _over_window(s, m)

@@ -11,9 +11,9 @@ from hannes_ros.lockstep import SETTLE_S, Peers, Probe, TickJoin
 from hannes_ros.sources import Sources
 
 from .motor_drive import MotorDrive
+from .motor_inputs import INPUTS
 
-_SLOTS = ("encoder_position", "motor_current", "reference_position")
-_TOPICS = tuple(topics.signal(name).topic for name in _SLOTS)
+_TOPICS = tuple(topics.signal(name).topic for name in INPUTS)
 
 
 class LockstepControl:
@@ -52,7 +52,7 @@ class LockstepControl:
 
     def on(self) -> None:
         """Motor on."""
-        self.active, self._drive.inputs.impossible = True, 0
+        self.active = True
         if self._join.synchronised:
             self._answer()
 
@@ -70,7 +70,7 @@ class LockstepControl:
         jumps = 0 <= self._came < sample.stamp_ns - self._period_ns
         if (jumps or (self._probe.held and sample.stamp_ns != self._came)) and self._sources.mixed():
             # No simulator leaves out ticks, or begins again while its tick is held.
-            self._node.fail(self._sources.surplus(_SLOTS[0]))
+            self._node.fail(self._sources.surplus(INPUTS[0]))
             return
         if sample.stamp_ns < self._answered:  # the simulator began again
             self._join.reset()
@@ -101,7 +101,7 @@ class LockstepControl:
 
     def _on_surplus(self, slot: int) -> None:
         """Messages of another source end the node; what one source repeated too late for `rejoin` is joined anew."""
-        name = _SLOTS[slot]
+        name = INPUTS[slot]
         if slot == 0 and self._join.synchronised:
             name = "motor_voltage"  # somebody else has answered, or the next motor/state would not be there
         if not self._join.synchronised or self._sources.count(name) > 1:

@@ -13,6 +13,9 @@ from hannes_ros.diagnostics import ERROR, WARN, Health
 
 from ..reference import travel_of
 
+INPUTS = ("encoder_position", "motor_current", "reference_position")
+"""Signals that the controller hears; the last one only without a profile of its own."""
+
 _STALLED = 3.0
 """Multiples of the current of the stalled motor above which a reading is none: driven backwards at full speed it draws
 twice that."""

@@ -12,6 +12,7 @@ from hannes_ros.loop import RealtimeLoop
 from hannes_ros.reach import not_beyond
 
 from .motor_drive import MotorDrive
+from .motor_inputs import INPUTS
 
 SLOWEST_STATE_HZ = 80.0
 _PATIENCE_S = 2.0
@@ -22,8 +23,7 @@ _MOST_IMPOSSIBLE = 10
 """Readings since the activation that no hand gives, from which on the motor is off: at 0 V a hand that tells mA
 soon draws little enough to be believed again."""
 TOO_OLD = "motor/state or motor/current is too old: 0 V"
-_HEARD = ("encoder_position", "motor_current")
-_STATE, _CURRENT, _REFERENCE = (topics.signal(n).topic for n in (*_HEARD, "reference_position"))
+_STATE, _CURRENT, _REFERENCE = (topics.signal(name).topic for name in INPUTS)
 
 
 class RealtimeControl:
