@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from hannes_description.signals import NAMESPACE
 from rclpy.clock import Clock, ClockType
@@ -12,6 +12,15 @@ from rclpy.timer import Timer
 DEFAULT_NAMESPACE: Final = NAMESPACE.strip("/")
 CLOCKS: Final = ("realtime", "lockstep")
 CLOCK_HELP: Final = "realtime runs by the clock of the machine, lockstep waits for every message of a tick"
+
+
+class Host(Protocol):
+    """What a part of a node needs of it: its clock, its log, and its end."""
+
+    def get_clock(self) -> Any: ...
+    def get_logger(self) -> Any: ...
+    def fail(self, error: object) -> None:
+        """End the process with this error."""
 
 
 class HannesNode:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from time import monotonic
-from typing import Any
 
 from hannes_ros import topics
 from hannes_ros.diagnostics import OK, WARN, Arrivals, silence
 from hannes_ros.lockstep import SETTLE_S, Peers, Probe, TickJoin
+from hannes_ros.node import Host
 from hannes_ros.sources import Sources
 
 from .motor_drive import MotorDrive
@@ -32,7 +32,7 @@ class LockstepControl:
 
     def __init__(
         self,
-        node: Any,
+        node: Host,
         drive: MotorDrive,
         sources: Sources,
         peers: Peers,

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from time import monotonic
-from typing import Any
 
 from hannes_ros import convert, topics
 from hannes_ros.diagnostics import ERROR, OK, SAY_AGAIN_S, WARN, Arrivals, silence
 from hannes_ros.lockstep import Peers
 from hannes_ros.loop import RealtimeLoop
+from hannes_ros.node import Host
 from hannes_ros.reach import not_beyond
 
 from .motor_drive import MotorDrive
@@ -42,7 +42,7 @@ class RealtimeControl:
 
     def __init__(
         self,
-        node: Any,
+        node: Host,
         drive: MotorDrive,
         peers: Peers,
         *,
