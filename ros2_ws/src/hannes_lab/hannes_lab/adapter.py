@@ -22,8 +22,9 @@ from hannes_sim.plant import PlantDiverged
 from numpy.typing import NDArray
 
 from .features import Features, kind_of, stands_for_all
+from .gaps import has_gap, widest_gap
 from .rig import REFERENCE_SIZES, PlantRig, Rig
-from .trials import EARLY, Closure, NoClosure, OfAll, Part, Trial, has_gap, left_out, unique_names, widest_gap
+from .trials import EARLY, Closure, NoClosure, OfAll, Part, Trial, left_out, unique_names
 from .units import AGAINST, ENCODER, FOLLOWS, STANDS, follows
 
 Array = NDArray[np.float64]

@@ -20,6 +20,7 @@ from .blocks import in_blocks, told_apart
 from .drift import drift_of, drift_together
 from .features import Features, build_features
 from .fit import fit
+from .gaps import misses_samples
 from .grasp import with_seen_objects
 from .hand import HandRig, other_plant
 from .join import Loaded, join_repeats, join_trials
@@ -39,7 +40,6 @@ from .trials import (
     Trial,
     compared,
     curves_of,
-    misses_samples,
     stem_of,
     trial_of,
     unique_names,

@@ -20,6 +20,7 @@ from hannes_description.errors import HannesError
 from numpy.typing import NDArray
 
 from .described import STRANGE_HOLD_RATE, ZERO_ORDER_HOLD_RATE, control_period, hold_rate
+from .gaps import has_gap, said_of_gaps, split_gaps, widest_gap
 from .units import in_si
 
 Array = NDArray[np.float64]
@@ -53,24 +54,11 @@ ALIKE = 0.1
 LEFT = 1e-3
 """It leaves from where it was last within this part of its span, or its own noise, of where it rests."""
 
-LONGEST_GAP = 5.0
-LEAST_GAP = 0.05
-"""Steps of a signal without a sample that are bridged by interpolation, and s that are in any case."""
-
-SHORT = 2.5
-"""Steps of a signal without a sample from which it is said to miss some in a closure that is unlike the others."""
-
 HOLDS = 0.5
 """s for which the last value of a reference holds at least, where its source ended."""
 
 CUT = 0.1
 """s at the end of a recording of which it is said that they are left out."""
-
-FOLLOWED = 0.25
-"""Part of the reference's span that an encoder goes over in a gap of it where there was something to follow."""
-
-MOST_TOLD = 4
-"""Gaps that are told one by one."""
 
 SAME_KIND = 0.03
 """Part of the smaller span within which the references of closures of one condition are alike."""
@@ -664,8 +652,8 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     end = min(float(t[-1]) for t, _ in samples.values())
     spans = find_closures(reference, period)
     inside = [(a, min(b, end)) for a, b in spans if a >= begin - EARLY and min(b, end) > a]
-    silent, alone = _split_gaps(logged[0], samples)
-    notes += _said_of_gaps(silent, alone, logged, samples.get("encoder_position"))
+    silent, alone = split_gaps(logged[0], samples)
+    notes += said_of_gaps(silent, alone, logged, samples.get("encoder_position"))
     # A closure that seems to begin where the silence ends began in it.
     whole = [
         span
@@ -762,89 +750,6 @@ def curves_of(closures: Sequence[Closure], time: Array, values: Array) -> Array:
     length = min(c.stop - c.start for c in closures)
     phase = np.linspace(0.02 * length, 0.95 * length, PHASES)
     return np.array([np.interp(c.start + phase, time, values) for c in closures])
-
-
-def misses_samples(time: Array, start: float, stop: float) -> bool:
-    """True where a signal has no sample for longer than it usually has, though not so long as to be a gap."""
-    steps = np.diff(time[(time >= start) & (time <= stop)])
-    return bool(steps.size) and float(steps.max()) > SHORT * float(np.median(np.diff(time)))
-
-
-def has_gap(time: Array, start: float, stop: float) -> bool:
-    """True where a signal has no sample for longer than a few of its steps, and long enough to hide something.
-
-    A gap may begin before the stretch or end after it: what lies within counts.
-    """
-    if np.count_nonzero((time >= start) & (time <= stop)) < 2:
-        return True
-    first = max(0, int(np.searchsorted(time, start, side="right")) - 1)
-    after = int(np.searchsorted(time, stop)) + 1
-    return float(np.diff(np.clip(time[first:after], start, stop)).max()) > _longest_step(time)
-
-
-def _longest_step(time: Array) -> float:
-    """Longest time between two samples that is bridged, s."""
-    return max(LONGEST_GAP * float(np.median(np.diff(time))), LEAST_GAP)
-
-
-def widest_gap(times: Mapping[str, Array]) -> str:
-    """Which signal has no sample for the longest, and where, as the end of a sentence."""
-    name, k, seconds = max(
-        ((n, int(np.argmax(np.diff(t))), float(np.diff(t).max())) for n, t in times.items() if t.size > 1),
-        key=lambda gap: gap[2],
-        default=("", 0, 0.0),
-    )
-    return f"; '{name}' has none for {seconds:.3g} s after {times[name][k]:.6g} s" if name else ""
-
-
-def _gaps(time: Array) -> list[Span]:
-    """Begin and end [s] of every gap that is not bridged."""
-    if time.size < 3:
-        return []
-    return [(float(time[k]), float(time[k + 1])) for k in np.flatnonzero(np.diff(time) > _longest_step(time))]
-
-
-def _split_gaps(time: Array, samples: Mapping[str, tuple[Array, Array]]) -> tuple[list[Span], list[Span]]:
-    """Gaps of the reference in which every signal has one too, and the others."""
-    of_signals = [_gaps(t) for t, _ in samples.values()]
-    silent: list[Span] = []
-    alone: list[Span] = []
-    for a, b in _gaps(time):
-        both = all(any(c < b and a < d for c, d in gaps) for gaps in of_signals)
-        (silent if both else alone).append((a, b))
-    return silent, alone
-
-
-def _said_of_gaps(
-    silent: Sequence[Span],
-    alone: Sequence[Span],
-    reference: tuple[Array, Array],
-    encoder: tuple[Array, Array] | None,
-) -> list[str]:
-    """Notes on gaps of the reference; one that stands, and the hand with it, may be logged only when it changes."""
-    time, values = reference
-    span = float(np.ptp(values))
-
-    def moves(a: float, b: float) -> bool:
-        if abs(float(np.diff(np.interp([a, b], time, values))[0])) > MOVES * span:
-            return True
-        done = encoder[1][(encoder[0] > a) & (encoder[0] < b)] if encoder is not None else np.zeros(0)
-        return bool(done.size) and float(np.ptp(done)) > FOLLOWED * span
-
-    notes = []
-    for gaps, begin, end in (
-        (silent, "nothing was recorded from", "what was there is not known"),
-        (
-            [gap for gap in alone if moves(*gap)],
-            "reference_position has no sample from",
-            "it is guessed there",
-        ),
-    ):
-        if gaps:
-            told = ", ".join(f"{a:.2f} to {b:.2f} s" for a, b in gaps[:MOST_TOLD])
-            more = f" and in {len(gaps) - MOST_TOLD} more places" if len(gaps) > MOST_TOLD else ""
-            notes.append(f"{begin} {told}{more}: {end}")
-    return notes
 
 
 def stem_of(source: str) -> str:
