@@ -142,12 +142,13 @@ def test_an_effect_with_which_conditions_are_foretold_worse_is_none(monkeypatch:
     features = SimpleNamespace(repeated=False, closures_of={"a": 1, "b": 1}, conditions=("a", "b"))
     search: Any = SimpleNamespace(problem=SimpleNamespace(features=features), fit_of=lambda names: None)
     found: Any = SimpleNamespace(names=("coulomb_friction", "cogging"))
+    limits: Any = None  # what judges by them says no here
 
     def falls(*errors: float) -> list[Fall]:
         return [Fall("", math.nan, math.nan, {}, (), {"encoder_position": error}) for error in errors]
 
     def why(last: float) -> str:
-        return _idle_at_the_end(search, found, None, falls(0.1, 0.05, 0.016, last), False)  # type: ignore[arg-type]
+        return _idle_at_the_end(search, found, limits, falls(0.1, 0.05, 0.016, last), False)
 
     assert why(0.021) == (
         "the error on held-out conditions rises with it from 0.32 to 0.42 times the fitted nominal model's"

@@ -9,7 +9,7 @@ suspicious is a sentence in `metadata["warnings"]`.
 from __future__ import annotations
 
 import warnings as python_warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -203,9 +203,10 @@ class _Reader:
         self.overrides = overrides
         self.warnings: list[str] = []
         self.repeats: dict[str, int] = {}
-        self.log_ns: dict[str, IntArray] = {}
+        self.log_ns: dict[str, IntArray] = {
+            topic: np.frombuffer(messages.log_ns, dtype=np.int64) for topic, messages in raw.items()
+        }
         self.coarse: dict[str, int] = {}
-        self.slow_clock = False
 
     def recording(self, sha256: str) -> Recording:
         chosen = self._choose()
@@ -223,7 +224,7 @@ class _Reader:
         states = {
             topic: self._decode(topic, cdr.decode_joint_states) for topic in encoder_first if self._is(topic)
         }
-        self.slow_clock = self._has_slow_clock(states)
+        self._spread_log_times(carried, states)
         relation = self._relation(states)
         samples: dict[str, tuple[IntArray, npt.NDArray[Any]]] = {}
         for topic, signals in carried.items():
@@ -324,28 +325,21 @@ class _Reader:
             cdr.FLOAT64_MULTI_ARRAY: cdr.decode_multi_arrays,
         }
         decode = decoders.get(msgtype, lambda raw: cdr.decode_numbers(raw, msgtype))
-        return self._log_ns(topic), self._decode(topic, decode)
+        return self.log_ns[topic], self._decode(topic, decode)
 
-    def _log_ns(self, topic: str) -> IntArray:
-        """Log times of a topic's messages; those of a slow /clock are spread."""
-        times = np.frombuffer(self.raw[topic].log_ns, dtype=np.int64)
-        if not self.slow_clock:
-            return times
-        if topic not in self.log_ns:
-            self.log_ns[topic], step = spread(times)
-            if step:
-                self.coarse[topic] = step
-        return self.log_ns[topic]
-
-    def _has_slow_clock(self, states: Mapping[str, list[cdr.JointStates]]) -> bool:
-        """Whether what is stamped was logged in steps that its stamps do not have; without stamps, whether any was."""
+    def _spread_log_times(self, topics: Iterable[str], states: Mapping[str, list[cdr.JointStates]]) -> None:
+        """Of a slow /clock: where what is stamped was logged in steps that its stamps do not have; without stamps,
+        where anything was."""
+        found = {topic: spread(self.log_ns[topic]) for topic in topics}
         for topic, blocks in states.items():
             stamps = np.sort(np.concatenate([block.stamp_ns for block in blocks]))
             if stamps.any():
-                times = np.frombuffer(self.raw[topic].log_ns, dtype=np.int64)
                 doubled = stamps.size > 1 and np.median(np.diff(stamps)) == 0
-                return bool(spread(times)[1]) and not doubled
-        return True
+                if doubled or not found[topic][1]:
+                    return
+                break
+        self.log_ns |= {topic: times for topic, (times, _) in found.items()}
+        self.coarse = {topic: step for topic, (_, step) in found.items() if step}
 
     def _stamped(self, topic: str, blocks: list[cdr.JointStates]) -> tuple[IntArray, IntArray] | None:
         """(stamps, log times) in the order of the topic; None if its publisher does not stamp."""
@@ -360,7 +354,7 @@ class _Reader:
                 "were used for all of them."
             )
             return None
-        return stamps, self._log_ns(topic)
+        return stamps, self.log_ns[topic]
 
     def _relation(self, states: dict[str, list[cdr.JointStates]]) -> ClockRelation:
         """The encoder's stamps lead; other stamped topics are checked against them."""
@@ -394,7 +388,7 @@ class _Reader:
     ) -> None:
         times = self.stamps.get(topic)
         if times is None:
-            times = relation.apply(self._log_ns(topic))
+            times = relation.apply(self.log_ns[topic])
         scalar = signals[0].name not in _JOINT_SIGNALS
         columns = [self._columns(topic, block, scalar) for block in blocks]
         usable = [

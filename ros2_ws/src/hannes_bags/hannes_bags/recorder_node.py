@@ -437,7 +437,7 @@ class RecorderNode(HannesNode, Node):
             )
         if self._simulated and self._times.went_back:
             self.get_logger().error(
-                f"{self._clock} went back: the bag holds more than one run, and is none to compare"
+                f"{self._clock} went back: the bag holds more than one run, or two clocks, and is none to compare"
             )
         self.get_logger().info(f"{recorder.writer.message_count} messages in {self._p.output}")
         named = self._p.topics or (signal("reference_position").topic,)

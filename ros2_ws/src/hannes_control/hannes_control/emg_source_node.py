@@ -121,9 +121,8 @@ class EmgSource(HannesNode, Node):
         """Publish the samples before number `until` that were not sent yet."""
         while self._sent < until:
             if self._sent < self._size:
-                self._publish(
-                    *(float(c[self._sent]) for c in (self._recording.flexor, self._recording.extensor))
-                )
+                emg, k = self._recording, self._sent
+                self._publish(float(emg.flexor[k]), float(emg.extensor[k]))
             else:
                 self._publish(0.0, 0.0)
             self._sent += 1

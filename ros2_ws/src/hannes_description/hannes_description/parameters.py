@@ -53,9 +53,9 @@ class Parameter:
         if self.status not in STATUSES:
             raise HannesError(f"status {self.status!r} is unknown; valid are {', '.join(STATUSES)}.")
         if self.tolerance is not None:
-            self._check(self.tolerance)
+            self._check_tolerance(self.tolerance)
 
-    def _check(self, tolerance: float) -> None:
+    def _check_tolerance(self, tolerance: float) -> None:
         if not (math.isfinite(tolerance) and tolerance >= 0.0):
             raise HannesError(
                 f"tolerance is {tolerance}; it must be 0 (known) or more, a part of the value (0.1: within 10 %)."

@@ -17,8 +17,9 @@ LEAST_GAP = 0.05
 SHORT = 2.5
 """Steps of a signal without a sample from which it is said to miss some in a closure that is unlike the others."""
 
-LEAST_MOVE = 0.04
-"""Part of its span by which a reference moves at least across a gap to be worth a word there."""
+MOVES = 0.04
+"""A reference moves where it goes beyond this part of its span: noise crosses the limit of rest many times while it
+leaves."""
 
 FOLLOWED = 0.25
 """Part of the reference's span that an encoder goes over in a gap of it where there was something to follow."""
@@ -89,7 +90,7 @@ def said_of_gaps(
     span = float(np.ptp(values))
 
     def moves(a: float, b: float) -> bool:
-        if abs(float(np.diff(np.interp([a, b], time, values))[0])) > LEAST_MOVE * span:
+        if abs(float(np.diff(np.interp([a, b], time, values))[0])) > MOVES * span:
             return True
         done = encoder[1][(encoder[0] > a) & (encoder[0] < b)] if encoder is not None else np.zeros(0)
         return bool(done.size) and float(np.ptp(done)) > FOLLOWED * span

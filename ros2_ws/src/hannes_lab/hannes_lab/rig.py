@@ -281,7 +281,7 @@ class PlantRig:
         A tolerance of its own goes before the usual one, and makes a nuisance of a parameter that is none; what is
         known (0) is none.
         """
-        told = {name: model.named(name) for name in model.names if model.named(name).tolerance is not None}
+        told = {name: p for name in model.names if (p := model.named(name)).tolerance is not None}
         out = []
         for nuisance in usual:
             own = told.pop(nuisance.name, None)
@@ -293,12 +293,12 @@ class PlantRig:
                 out.append(self._within(told_here, model, model.parameters.origin(nuisance.name)))
         for name, own in sorted(told.items()):
             if own.tolerance:
+                where = model.parameters.origin(name)
                 if not (name in self._plant(model, self.trials[0])[0].names or self.is_gain(name)):
                     raise HannesError(
-                        f"{model.parameters.origin(name)}: '{name}' has a tolerance, but no fit can move it on the "
-                        f"plant '{model.plant}': take the tolerance out."
+                        f"{where}: '{name}' has a tolerance, but no fit can move it on the plant '{model.plant}': take "
+                        "the tolerance out."
                     )
-                where = model.parameters.origin(name)
                 out.append(self._within(relative_prior(name, own, own.tolerance), model, where))
         return out
 

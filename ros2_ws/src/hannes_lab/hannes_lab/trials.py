@@ -20,11 +20,10 @@ from hannes_description.errors import HannesError
 from numpy.typing import NDArray
 
 from .described import STRANGE_HOLD_RATE, ZERO_ORDER_HOLD_RATE, control_period, hold_rate
-from .gaps import has_gap, said_of_gaps, split_gaps, widest_gap
+from .gaps import MOVES, has_gap, said_of_gaps, split_gaps, widest_gap
 from .units import in_si
 
 Array = NDArray[np.float64]
-Span = tuple[float, float]
 
 SIGNALS = ("encoder_position", "motor_current", "motor_voltage", "grip_force")
 """Signals that are compared, in this order, as far as a recording has them."""
@@ -44,9 +43,6 @@ _NEGATIVE = 0.005
 RESTS = 0.02
 HELD = 0.05
 """A reference rests within this part of its span from its rest value, which it has for so large a part of the time."""
-
-MOVES = 0.04
-"""It moves where it goes beyond this part of its span: noise crosses the limit of rest many times while it leaves."""
 
 ALIKE = 0.1
 """Closures of which the moving parts differ in length by less than this part are taken to leave their rest alike."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from dataclasses import dataclass, replace
 from time import monotonic
@@ -243,15 +242,17 @@ class HandSim(HannesNode, Node):
 
     # -- real time ---------------------------------------------------------------------------------------------------
     def _on_voltage(self, data: bytes) -> None:
-        self._gate.command(self._judged(convert.float64_value(data)), monotonic())
+        self._command(convert.float64_value(data))
 
-    def _judged(self, voltage: float) -> float:
-        """The voltage; one that is not finite is said: the hand stands as if nobody drove it."""
-        if math.isfinite(voltage):
+    def _command(self, voltage: float) -> float:
+        """What the motor gets (V); that the gate takes none is said: the hand stands as if nobody drove it."""
+        rejected = self._gate.rejected
+        applied = self._gate.command(voltage, monotonic())
+        if self._gate.rejected == rejected:
             self._health.faults.good("motor/voltage")
         else:
             self._health.faults.bad("motor/voltage", ERROR, f"motor/voltage is not finite ({voltage}): 0 V")
-        return voltage
+        return applied
 
     def _step(self, now: float, elapsed: int) -> None:
         """One period of the real-time thread; periods that were missed are made up for, within reason."""
@@ -304,7 +305,7 @@ class HandSim(HannesNode, Node):
 
     def _take(self, voltage: float) -> None:
         self._waiting = False
-        if self._advance(self._gate.command(self._judged(voltage), monotonic()), 1):
+        if self._advance(self._command(voltage), 1):
             self._publish_tick()
 
     def _check_lockstep(self) -> None:

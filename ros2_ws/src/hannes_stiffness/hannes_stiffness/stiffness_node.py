@@ -20,7 +20,7 @@ from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
 from hannes_ros.run import run_node
 from hannes_ros.sources import Sources
-from hannes_ros.topics import publisher, subscription
+from hannes_ros.topics import publisher, signal, subscription
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray, String
 
@@ -28,10 +28,10 @@ from .classifier import NOT_SURE, StiffnessClassifier, class_label
 from .features import FeatureStream, Sample, believable
 
 _STATE, _CURRENT, _REFERENCE = range(3)
-_NAMES = ("motor/state", "motor/current", "reference_position")
 _PATIENCE_S = 2.0
 """s without an answer to states that come, from which on that is said."""
 _INPUTS = ("encoder_position", "motor_current", "reference_position")
+_NAMES = tuple(signal(name).topic for name in _INPUTS)
 _LONGEST_QUEUE = 4000
 """Messages without a whole tick after which lock-step is joined anew; most currents kept between two states.
 
@@ -234,8 +234,8 @@ class StiffnessNode(HannesNode, Node):
             ]
         else:
             silent = [
-                name
-                for slot, name in ((_CURRENT, "motor/current"), (_REFERENCE, "reference_position"))
+                _NAMES[slot]
+                for slot in (_CURRENT, _REFERENCE)
                 if slot not in self._latest or self._time - self._latest[slot][1] > self._settings.timeout
             ]
         before, self._counted = self._counted, {**self._health.counts, "out_of_order": self._stream.rejected}
