@@ -148,6 +148,14 @@ def test_an_effect_twice_is_refused() -> None:
         Model("m", "reduced", load_parameters("hannes"), effects=(entry, entry))
 
 
+def test_a_unit_of_one_needs_no_quotes(tmp_path: Path) -> None:
+    """YAML reads `unit: 1` as a number."""
+    file = tmp_path / "mine.yaml"
+    entry = "{value: 16.0, unit: 1, status: measured, source: x}"
+    file.write_text(f"schema: hannes/model/1\noverrides: {{gear.ratio: {entry}}}\n")
+    assert Model.load(file).parameters.value("gear.ratio") == 16.0
+
+
 def test_what_a_model_file_overrides_is_told_by_its_own_name(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     for value in (0, -1e-6):

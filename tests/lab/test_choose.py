@@ -81,6 +81,8 @@ def given(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     monkeypatch.setattr(module, "is_adequate", lambda s, c, limits, room=1.0: c.fit.cost <= limits.misfit)
     monkeypatch.setattr(module, "chance", lambda *a: LIMITS)
     monkeypatch.setattr(module, "distorted", lambda search, c: "")
+    monkeypatch.setattr(module, "stands_out", lambda *args: "")
+    monkeypatch.setattr(module, "as_it_repeats", lambda *args: "")
     return monkeypatch
 
 
@@ -98,10 +100,11 @@ def test_what_leads_back_joins_though_another_fits_better(given: pytest.MonkeyPa
     [
         (0.10, 4.0, 2.5, True),
         (0.10, 4.0, 3.0, False),
-        (0.03, 4.0, 2.5, False),
+        (0.03, 4.0, 2.5, True),
+        (0.02, 4.0, 2.5, False),
         (0.10, 1.2, 1.0, False),
     ],
-    ids=["halves", "does not", "chance", "as it repeats"],
+    ids=["halves", "does not", "hardly more than chance", "chance", "as it repeats"],
 )
 def test_a_small_second_effect_joins_where_it_halves_what_was_left_out(
     given: pytest.MonkeyPatch, gain: float, before: float, after: float, joins: bool
@@ -114,6 +117,24 @@ def test_a_small_second_effect_joins_where_it_halves_what_was_left_out(
     search.held_out = {one.names: before, two.names: after}
     choice = choose(search, NULL, LIMITS, 2)
     assert choice.best is (two if joins else one)
+
+
+def test_what_misses_nothing_by_more_than_it_repeats_lacks_nothing(given: pytest.MonkeyPatch) -> None:
+    """A current sensor was named of a hand without an error of it, for one condition that two others did not tell."""
+    one = made(("a",), 500.0, 5.0)
+    given.setattr(module, "_extended", lambda *args: [one])
+    given.setattr(module, "is_adequate", lambda *args, **room: True)
+    given.setattr(module, "as_it_repeats", lambda *args: "it repeats no better")
+    choice = choose(search_of(NULL, one), NULL, LIMITS, 1)
+    assert choice.best is NULL and [rank.names for rank in choice.ranking] == [("a",)]
+    assert choice.notes == ("a would fit better still, but it repeats no better: it is not named",)
+
+    back = made(("a",), 500.0, 1.0)
+    given.setattr(module, "_extended", lambda *args: [back])
+    assert choose(search_of(NULL, back), NULL, LIMITS, 1).best is back, "what it leads back was far off"
+    given.setattr(module, "_extended", lambda *args: [one])
+    given.setattr(module, "stands_out", lambda *args: "one recorded once")
+    assert choose(search_of(NULL, one), NULL, LIMITS, 1).best is one
 
 
 def test_the_form_of_another_machine_is_no_effect(given: pytest.MonkeyPatch) -> None:

@@ -615,9 +615,21 @@ def test_an_effect_that_the_data_leave_open_must_take_half_of_the_error(
 def test_what_fits_as_well_as_one_that_is_judged_is_judged_too() -> None:
     costs = [100.0, 110.0, 120.0, 120.1, 120.4, 130.0]
     candidates: Any = [SimpleNamespace(penalised=cost) for cost in costs]
-    assert [c.penalised for c in to_judge(candidates)] == [100.0, 110.0, 120.0, 120.1]
+    none = [False] * 6
+    assert [c.penalised for c in to_judge(candidates, none)] == [100.0, 110.0, 120.0, 120.1]
     same: Any = [SimpleNamespace(penalised=100.0) for _ in range(9)]
-    assert len(to_judge(same)) == 6 and to_judge(candidates[:2]) == candidates[:2]
+    assert len(to_judge(same, [False] * 9)) == 6
+    assert to_judge(candidates[:2], none[:2]) == candidates[:2]
+
+
+def test_effects_of_ones_own_are_judged_beside_the_best_of_the_catalogue() -> None:
+    """Two of them that fit best, and foretold nothing, had taken the place of the one that would have joined."""
+    costs = [100.0, 110.0, 120.0, 130.0, 140.0, 150.0]
+    candidates: Any = [SimpleNamespace(penalised=cost) for cost in costs]
+    own = [True, True, False, False, False, False]
+    assert [c.penalised for c in to_judge(candidates, own)] == costs[:5]
+    assert [c.penalised for c in to_judge(candidates, [False, False, False, False, True, True])] == costs[:3]
+    assert to_judge(candidates, [True, True, True, True, False, False]) == candidates
 
 
 def test_a_further_parameter_must_be_worth_it() -> None:
@@ -648,6 +660,7 @@ def test_a_simpler_effect_that_does_not_join_ends_no_search(
     search: Any = SimpleNamespace(
         each=each,
         keep=lambda candidate: candidate,
+        own=lambda name: False,
         once=lambda function, *item, text: each(function, [item], text)[0],
         effect=lambda name: SimpleNamespace(parameters=range(2 - int(name[-1]))),
     )

@@ -192,7 +192,8 @@ class Model:
                 raise HannesError(f"{where}: unknown parameter '{name}'; valid are {', '.join(near)}.")
             own = parameters[str(name)]
             if isinstance(entry, Mapping) and "unit" in entry:
-                if entry["unit"] != own.unit:
+                # A YAML file's `unit: 1` is a number.
+                if str(entry["unit"]) != own.unit:
                     raise HannesError(
                         f"{where}: parameter '{name}' is in '{entry['unit']}'; it must be in '{own.unit}', as in "
                         f"{base}: convert value, lower and upper."

@@ -12,7 +12,15 @@ from .adequacy import disbelieved, distorted, is_adequate, leads_back, led_off, 
 from .chance import Chance, chance
 from .diagnosis import Rank
 from .features import Features
-from .greedy import AS_IT_REPEATS, JUDGED, grown_straight, held_out_error, largest_error, stands_out
+from .greedy import (
+    AS_IT_REPEATS,
+    JUDGED,
+    as_it_repeats,
+    grown_straight,
+    held_out_error,
+    largest_error,
+    stands_out,
+)
 from .search import HOPELESS, PENALTY, Candidate, Search, key_of
 
 WORTHWHILE = 0.05
@@ -138,11 +146,14 @@ def choose(
         gains = [choice.best.penalised + PENALTY - c.penalised for c in round_]
         needed = [needed_gain(choice, choice.best, c, first=first_one) for c in round_]
         joins = next((k for k, gain in enumerate(gains) if gain >= needed[k]), None)
-        if joins is None and not first_one and _may_halve(choice, choice.best, round_[0], 1.0):
+        if joins is None and not first_one and _may_halve(choice, choice.best, round_[0]):
             # A small gain is not polished by itself, and what it is, and foretells, depends on where the fit has come.
             better = choice.search.polished(round_, round_[:JUDGED], text)
             if _halves(choice, choice.best, better[0]):
                 joins, round_ = 0, better
+        if joins is not None and (why := _settled(choice, round_[joins])):
+            said = f"{' and '.join(round_[joins].names)} would fit better still, but {why}: it is not named"
+            joins, choice = None, replace(choice, notes=(*choice.notes, said))
         # Those that fit better, but gain less than is asked of them, are no rivals of the first that joins.
         short = round_[: joins or 0]
         round_ = [c for c in round_ if c not in short]
@@ -295,6 +306,20 @@ def needed_gain(
     return max(limits.gain, 0.0 if enough or back else WORTHWHILE * base.fit.cost) * further
 
 
+def _settled(choice: Choice, extended: Candidate) -> str:
+    """Why the chosen set needs no further effect where the model has an error of its own, in words; empty if it may.
+
+    What repeats as badly as that hides the form of another machine too, which may be all that an effect would follow;
+    held-out conditions then say how well the others tell the parameters, and no more.  Not so of an effect that leads
+    back what is far off.
+    """
+    search, best = choice.search, choice.best
+    judged = search.problem.discrepancy and is_adequate(search, best, choice.limits)
+    if not judged or leads_back(best, extended) or stands_out(search, best):
+        return ""
+    return as_it_repeats(search, best)
+
+
 def scatter_is_a_guess(search: Search) -> bool:
     """Whether nothing was repeated of a machine of others: then neither repeats nor chance tell an effect from what the
     model's form is off by, and one must take half of the misfit.
@@ -303,14 +328,12 @@ def scatter_is_a_guess(search: Search) -> bool:
     return problem.rig.foreign and not (problem.discrepancy or problem.features.repeated)
 
 
-def _may_halve(
-    choice: Choice, base: Candidate, extended: Candidate, times: float = FURTHER * OWN_ERROR_CHANCE
-) -> bool:
-    """Whether effects gain so many times what chance does, and held-out conditions can tell what more they are."""
+def _may_halve(choice: Choice, base: Candidate, extended: Candidate) -> bool:
+    """Whether effects gain more than chance does, and held-out conditions can tell what more they are."""
     search = choice.search
     gain = base.penalised + PENALTY - extended.penalised
     fast = not search.slow and can_be_held_out(search.problem.features)
-    return fast and bool(search.problem.discrepancy) and gain >= times * choice.limits.gain
+    return fast and bool(search.problem.discrepancy) and gain >= choice.limits.gain
 
 
 def _halves(choice: Choice, base: Candidate, extended: Candidate) -> bool:

@@ -18,7 +18,8 @@ from .report_text import listed, words
 from .search import Candidate, Search
 
 JUDGED = 3
-"""Candidates of each round (the best fits) whose error on held-out conditions is found."""
+"""Candidates of each round (the best fits) whose error on held-out conditions is found, beside those of the user's own
+effects that fit better: what is offered must not cost what is found without it."""
 
 TWIN = 0.002
 """Part of its cost by which a further candidate may differ from one of these, and be judged too: where the two are the
@@ -108,6 +109,17 @@ def largest_error(search: Search, candidate: Candidate) -> float:
     return max((e.ratio for e in errors if math.isfinite(e.ratio)), default=math.inf)
 
 
+def as_it_repeats(search: Search, candidate: Candidate) -> str:
+    """That a fit misses nothing by more than chance may, in words; empty where it does."""
+    largest = largest_error(search, candidate)
+    if largest > AS_IT_REPEATS:
+        return ""
+    return (
+        f"in no signal of any condition is the error of the fit more than {largest:.2f} times the repeatability (up to "
+        f"{AS_IT_REPEATS} it may be chance)"
+    )
+
+
 def stands_out(search: Search, candidate: Candidate) -> str:
     """Which conditions that were recorded once a fit misses by more than the others repeat; empty if it misses none.
 
@@ -171,11 +183,10 @@ def grow(
                 f"{AS_IT_REPEATS} it may be chance): the search stops here"
             )
             break
-        if not (units or missed or best.names) and (largest := largest_error(search, best)) <= AS_IT_REPEATS:
+        if not (units or missed or best.names) and (why := as_it_repeats(search, best)):
             notes.append(
-                f"in no signal of any condition is the error of the fit more than {largest:.2f} times the "
-                f"repeatability (up to {AS_IT_REPEATS} it may be chance): there is nothing to look for. That on "
-                f"conditions that were left out ({errors[-1]:.2f}) says how well the others tell the parameters"
+                f"{why}: there is nothing to look for. That on conditions that were left out ({errors[-1]:.2f}) says "
+                "how well the others tell the parameters"
             )
             break
         text = f"effect {len(best.names) + 1}"
@@ -270,7 +281,8 @@ def _judge(
     Each error counts in multiples of what it may be at most (LEFT_OPEN, or 1 - gain, of the mean square without it).
     """
     sound = [c for c in candidates if not distorted(search, c)] or candidates
-    judged = search.each(_polish_in_worker, [(c,) for c in to_judge(sound)], f"{text}: polish")
+    chosen = to_judge(sound, [search.own(c.names[-1]) for c in sound])
+    judged = search.each(_polish_in_worker, [(c,) for c in chosen], f"{text}: polish")
     held = search.each(held_out_error, [(c, True, units) for c in judged], f"{text}: held-out conditions")
     left_open = [_left_open(search, candidate, base) for candidate in judged]
     most = [min(LEFT_OPEN, 1.0 - gain) if names else 1.0 - gain for names in left_open]
@@ -302,12 +314,14 @@ def _judge(
     return _Judged(judged[winner], error, rivals, most[winner], left_open[winner])
 
 
-def to_judge(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """The best fits of a round, best first, and their twins."""
-    first = list(candidates[:JUDGED])
+def to_judge(candidates: Sequence[Candidate], own: Sequence[bool]) -> list[Candidate]:
+    """The best fits of a round, best first, and their twins; those of `own` effects take nobody's place."""
+    known = [k for k, one in enumerate(own) if not one]
+    count = known[JUDGED - 1] + 1 if len(known) >= JUDGED else len(candidates)
+    first = list(candidates[:count])
     twins = [
         c
-        for c in candidates[JUDGED:]
+        for c in candidates[count:]
         if any(abs(c.penalised - one.penalised) <= TWIN * one.penalised for one in first)
     ]
     return [*first, *twins[:JUDGED]]

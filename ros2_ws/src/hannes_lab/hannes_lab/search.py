@@ -173,6 +173,10 @@ class Search:
     def effect(self, name: str) -> EffectType:
         return self.problem.rig.effect(load_effect(self.sources[name]))
 
+    def own(self, name: str) -> bool:
+        """Whether an effect is the user's, and not of the catalogue."""
+        return ":" in self.sources[name]
+
     def null(self) -> Candidate:
         """The model as it is, with its nuisance parameters fitted."""
         if () not in self.found:
@@ -214,7 +218,7 @@ class Search:
         model, coordinates = self.model, list(self.coordinates)
         for name in names:
             kind = self.effect(name)
-            source = self.sources[name] if ":" in self.sources[name] else None
+            source = self.sources[name] if self.own(name) else None
             model = model.with_effect(vanishing_entry(kind, source))
             coordinates += effect_coordinates(kind)
         return model, tuple(coordinates)

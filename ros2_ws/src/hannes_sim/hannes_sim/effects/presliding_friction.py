@@ -12,7 +12,8 @@ class PreslidingFriction(Effect):
 
     Equation: dz/dq = (sign(v) - z) / l (Dahl 1968, the bristle of LuGre without its velocity terms), torque -F z, and
     the same level F taken off the plant's dry friction, so that nothing changes while it slides.  Exact over a step
-    of constant velocity: z -> sign + (z - sign) exp(-|dq| / l).
+    of constant velocity: z -> sign + (z - sign) exp(-|dq| / l).  So l is what a reversal shows; friction of many
+    contacts (Maxwell slip, Masing) builds up over half of it from rest.
     Limits: F beyond the plant's dry friction adds friction; no damping of the bristles, no dwell time.  In recordings
     of another machine a length below 0.1 % of the travel is told, but not named: every real friction sets in over some.
     """
