@@ -16,7 +16,7 @@ from hannes_lab.adequacy import OWN_ERROR_MOST, is_adequate, shortfall, worst_er
 from hannes_lab.chance import chance
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Diagnosis
-from hannes_lab.hand import OWN_ERROR_DRIVE
+from hannes_lab.hand import OWN_ERROR_DRIVE, model_of
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.search import Search
@@ -37,7 +37,11 @@ def diagnosed(*effects: str) -> Diagnosis:
         conditions=QUICK,
     )
     assert {recording.metadata["plant"] for recording in made} == {"mujoco"}
-    prepared = prepare([make_trial(recording) for recording in made], Model.load())
+    trials = [make_trial(recording) for recording in made]
+    assert model_of(trials) == "nominal_mujoco"
+    silent = replace(trials[0], options={"plant": "mujoco"})
+    assert model_of([silent, *trials[1:]]) == "nominal", "one does not describe itself"
+    prepared = prepare(trials, Model.load())
     assert "wire.stiffness" in [n.name for n in prepared.nuisances]
     assert prepared.problem.discrepancy
     (said,) = (note for note in prepared.notes if "made them" in note)

@@ -142,18 +142,7 @@ def choose(
             # The set without it may find its way further down from there; what is left is the gain.
             (base,) = choice.search.without(round_[0], [choice.best.names])
             choice = replace(choice, best=base)
-        # What chance gains was found for effects of one free strength; further parameters pay their penalty.
-        gains = [choice.best.penalised + PENALTY - c.penalised for c in round_]
-        needed = [needed_gain(choice, choice.best, c, first=first_one) for c in round_]
-        joins = next((k for k, gain in enumerate(gains) if gain >= needed[k]), None)
-        if joins is None and not first_one and _may_halve(choice, choice.best, round_[0]):
-            # A small gain is not polished by itself, and what it is, and foretells, depends on where the fit has come.
-            better = choice.search.polished(round_, round_[:JUDGED], text)
-            if _halves(choice, choice.best, better[0]):
-                joins, round_ = 0, better
-        if joins is not None and (why := _settled(choice, round_[joins])):
-            said = f"{' and '.join(round_[joins].names)} would fit better still, but {why}: it is not named"
-            joins, choice = None, replace(choice, notes=(*choice.notes, said))
+        choice, round_, joins = _joining(choice, round_, text, first=first_one)
         # Those that fit better, but gain less than is asked of them, are no rivals of the first that joins.
         short = round_[: joins or 0]
         round_ = [c for c in round_ if c not in short]
@@ -184,6 +173,36 @@ def choose(
             break
         front, far = [best, *near[1:]], [c for c in wide if c not in rivals]
     return pruned(choice)
+
+
+def _joining(
+    choice: Choice, round_: list[Candidate], text: str, *, first: bool
+) -> tuple[Choice, list[Candidate], int | None]:
+    """Which of a round's candidates, best first, is the next chosen set, by its place; None if none gains enough.
+
+    With it the choice, with a note on what is not named all the same, and the round as it was polished.
+    """
+    # What chance gains was found for effects of one free strength; further parameters pay their penalty.
+    gains = [choice.best.penalised + PENALTY - c.penalised for c in round_]
+    needed = [needed_gain(choice, choice.best, c, first=first) for c in round_]
+    joins = next((k for k, gain in enumerate(gains) if gain >= needed[k]), None)
+    if joins is None and not first and _may_halve(choice, choice.best, round_[0]):
+        # A small gain is not polished by itself, and what it is, and foretells, depends on where the fit has come.
+        better = choice.search.polished(round_, round_[:JUDGED], text)
+        if _halves(choice, choice.best, better[0]):
+            joins, round_ = 0, better
+    if joins is not None and (why := _settled(choice)):
+        return (
+            with_unnamed(choice, f"{' and '.join(round_[joins].names)} would fit better: {why}"),
+            round_,
+            None,
+        )
+    return choice, round_, joins
+
+
+def with_unnamed(choice: Choice, said: str) -> Choice:
+    """The choice with a sentence on effects that fit better and are not named: in the summary where none is."""
+    return replace(choice, notes=(*choice.notes, said)) if choice.best.names else replace(choice, idle=said)
 
 
 def can_be_held_out(features: Features) -> bool:
@@ -306,16 +325,15 @@ def needed_gain(
     return max(limits.gain, 0.0 if enough or back else WORTHWHILE * base.fit.cost) * further
 
 
-def _settled(choice: Choice, extended: Candidate) -> str:
+def _settled(choice: Choice) -> str:
     """Why the chosen set needs no further effect where the model has an error of its own, in words; empty if it may.
 
     What repeats as badly as that hides the form of another machine too, which may be all that an effect would follow;
-    held-out conditions then say how well the others tell the parameters, and no more.  Not so of an effect that leads
-    back what is far off.
+    held-out conditions then say how well the others tell the parameters, and no more.  What is far off is told.
     """
     search, best = choice.search, choice.best
     judged = search.problem.discrepancy and is_adequate(search, best, choice.limits)
-    if not judged or leads_back(best, extended) or stands_out(search, best):
+    if not judged or stands_out(search, best):
         return ""
     return as_it_repeats(search, best)
 

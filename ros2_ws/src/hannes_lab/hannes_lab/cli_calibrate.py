@@ -25,8 +25,13 @@ def calibrate(
     free: Annotated[str, typer.Option("--free", help="Names of the free parameters, with commas between.")],
     out: Annotated[Path, typer.Option("--out", help="Model file to write.")] = Path("my_hand.yaml"),
     model: Annotated[
-        str, typer.Option("--model", help="Model file, or the name of a shipped model.")
-    ] = "nominal",
+        str | None,
+        typer.Option(
+            "--model",
+            help="Model file, or the name of a shipped model; default: nominal (nominal_mujoco of recordings of the "
+            "full hand in the simulator).",
+        ),
+    ] = None,
     prior: Annotated[
         list[str] | None,
         typer.Option(

@@ -16,7 +16,8 @@ ModelFile = Annotated[
     str | None,
     typer.Option(
         "--model",
-        help="Model file, or the name of a shipped model; default: nominal, with --rig the model of the adapter.",
+        help="Model file, or the name of a shipped model; default: nominal (nominal_mujoco of "
+        "recordings of the full hand in the simulator), with --rig the model of the adapter.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]

@@ -24,6 +24,7 @@ from .choose import (
     must_be_held_out,
     needed_gain,
     tied_sets,
+    with_unnamed,
 )
 from .conclusion import Conclusion
 from .delays import in_time
@@ -292,7 +293,7 @@ def _answer(prepared: Prepared, search: Search, max_effects: int, greedy: bool) 
                 if _foretells((*falls, with_it, behind[-1])):
                     choice, falls = other, behind
             said = law_sentence(effect, how, with_it.held_out, min(fall.held_out for fall in falls))
-            choice = _with_unnamed(choice, said)
+            choice = with_unnamed(choice, said)
         choice, falls = without_idle(choice, falls)
         first, instead = _named_instead(choice, search)
         if instead is not choice:
@@ -476,12 +477,7 @@ def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple
         return replace(choice, notes=(*choice.notes, led_back_sentence(choice.best, part))), falls
     fewer = falls[: keep + WITHOUT_EFFECT]
     idle = idle_sentence(choice.best, part, falls[-1], fewer[-1])
-    return _with_unnamed(cut_to(choice, part), idle), fewer
-
-
-def _with_unnamed(choice: Choice, said: str) -> Choice:
-    """The choice with a sentence on effects that fit better and are not named: in the summary where none is."""
-    return replace(choice, notes=(*choice.notes, said)) if choice.best.names else replace(choice, idle=said)
+    return with_unnamed(cut_to(choice, part), idle), fewer
 
 
 def _foretells(falls: Sequence[Fall]) -> bool:

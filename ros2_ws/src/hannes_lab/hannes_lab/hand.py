@@ -180,8 +180,17 @@ def is_of(trial: Trial, model: Model) -> bool:
     return is_described(trial) and trial.options.get("plant") == model.plant
 
 
-MODEL_OF = {"reduced": "nominal", "mujoco": "nominal_mujoco"}
+NOMINAL = "nominal"
+"""The model that recordings are compared with where nothing says another."""
+
+MODEL_OF = {"reduced": NOMINAL, "mujoco": "nominal_mujoco"}
 """The plant that a recording names, and the model that has it."""
+
+
+def model_of(trials: Sequence[Trial]) -> str:
+    """The shipped model that has the plant which made all recordings, as they say; `nominal` where they do not."""
+    made = {str(trial.options["plant"]) if is_described(trial) else "" for trial in trials}
+    return MODEL_OF.get(made.pop(), NOMINAL) if len(made) == 1 else NOMINAL
 
 
 def other_plant(trials: Sequence[Trial], model: Model) -> list[str]:

@@ -17,6 +17,7 @@ from .cache import Store
 from .compare import Comparison, compare
 from .diagnosis import Diagnosis
 from .executor import Executor
+from .hand import NOMINAL, model_of
 from .own_effect import along_reference, check_own_effects, first_closure
 from .prepare import Prepared, load_trials, prepare, read_trials
 from .rig import PlantRig, load_rig
@@ -35,12 +36,19 @@ def prepared_from(
 ) -> Prepared:
     """Recordings and a model, ready; the options are those of the command line, as texts.
 
-    model    None: that of the adapter, or `nominal`
+    model    None: that of the adapter, or the shipped one whose plant made the recordings, as they say
     threads  see prepare
     """
     machine, trials = trials_from(bags, objects, rig, scale, topics)
-    model = model or (str(machine.model) if machine else "nominal")
-    return prepare(trials, Model.load(model), rig=machine, signals=signals, surrogate=True, threads=threads)
+    given = model or (str(machine.model) if machine else model_of(trials))
+    out = prepare(trials, Model.load(given), rig=machine, signals=signals, surrogate=True, threads=threads)
+    if model or machine or given == NOMINAL:
+        return out
+    note = (
+        f"the recordings say that they are of the plant of model {given}, so that is compared; --model {NOMINAL} is "
+        "faster, and compares them as another machine's"
+    )
+    return replace(out, notes=(note, *out.notes))
 
 
 def trials_from(
