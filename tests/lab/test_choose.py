@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,7 +11,14 @@ from hannes_description.errors import HannesError
 from hannes_lab import choose as module
 from hannes_lab import wording
 from hannes_lab.chance import Chance
-from hannes_lab.choose import OWN_ERROR_PART, Choice, _thoroughly, choose, choose_greedily
+from hannes_lab.choose import (
+    OWN_ERROR_PART,
+    Choice,
+    _thoroughly,
+    choose,
+    choose_greedily,
+    judged_by_conditions,
+)
 from hannes_lab.diagnose import _behind_the_law, effect_sources
 from hannes_lab.search import PENALTY, Candidate
 from hannes_lab.wording import lead, nearest_sentence
@@ -131,6 +138,42 @@ def test_what_misses_nothing_by_more_than_it_repeats_lacks_nothing(given: pytest
 
     given.setattr(module, "stands_out", lambda *args: "one recorded once")
     assert choose(search_of(NULL, one), NULL, LIMITS, 1).best is one
+
+
+@pytest.mark.parametrize(
+    ("at_end", "repeated", "verdict"),
+    [
+        ("brush_drop.voltage", False, "doubt"),
+        ("motor.kt", False, "enough"),
+        ("brush_drop.voltage", True, "enough"),
+    ],
+)
+def test_an_effect_at_the_end_of_its_range_is_no_answer_without_repeats(
+    monkeypatch: pytest.MonkeyPatch, at_end: str, repeated: bool, verdict: str
+) -> None:
+    """A brush drop of 1.5 V, the end, stood for a bridge that coasts."""
+    fit: Any = SimpleNamespace(at_end=[SimpleNamespace(name=at_end)], off=[], model=SimpleNamespace(names=()))
+    best = cast(Any, SimpleNamespace(names=("brush_drop",), fit=fit, far_off=False, penalised=1.0))
+    monkeypatch.setattr(module, "is_adequate", lambda *args: False)
+    for quiet in ("stands_out", "disbelieved", "led_off"):
+        monkeypatch.setattr(module, quiet, lambda *args: "")
+    monkeypatch.setattr(module, "shortfall", lambda *args: "misfit")
+    search: Any = SimpleNamespace(problem=SimpleNamespace(features=SimpleNamespace(repeated=repeated)))
+    choice = judged_by_conditions(Choice(search, best, LIMITS, False, ()), NULL, 4.0, 1.4)
+    assert choice.enough is (verdict == "enough")
+    assert ("brush_drop.voltage to the end of its range" in choice.left) is (verdict == "doubt")
+
+
+@pytest.mark.parametrize("largest", [1.1, 27.0])
+def test_what_was_recorded_once_leads_only_where_what_was_repeated_is_met(
+    monkeypatch: pytest.MonkeyPatch, largest: float
+) -> None:
+    monkeypatch.setattr(module, "is_adequate", lambda *args: False)
+    monkeypatch.setattr(module, "stands_out", lambda *args: "speed of '40 rpm'")
+    monkeypatch.setattr(module, "largest_error", lambda *args: largest)
+    search: Any = SimpleNamespace(problem=SimpleNamespace(features=SimpleNamespace(repeated=True)))
+    choice = judged_by_conditions(Choice(search, NULL, LIMITS, False, ()), NULL, 4.0, 4.0)
+    assert choice.alone == ("speed of '40 rpm'" if largest < 2.0 else "")
 
 
 def test_the_form_of_another_machine_is_no_effect(given: pytest.MonkeyPatch) -> None:

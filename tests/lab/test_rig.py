@@ -330,6 +330,17 @@ def test_effects_without_a_meaning_are_not_offered(prepared: Prepared) -> None:
     assert any("wire_slack" in note and "move none" in note for note in usable.notes)
 
 
+def test_what_compares_the_directions_is_not_offered_to_a_machine_that_goes_one_way(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sources = effect_sources(only=["direction_dependent_friction", "coulomb_friction"])
+    assert set(usable_effects(prepared, sources).sources) == set(sources)
+    monkeypatch.setattr("hannes_lab.screen.never_turns", lambda trials: True)
+    usable = usable_effects(prepared, sources)
+    assert set(usable.sources) == {"coulomb_friction"}
+    assert "direction_dependent_friction is not considered: every condition goes the same way" in usable.notes
+
+
 def test_an_effect_that_acts_on_another_is_offered(prepared: Prepared) -> None:
     """The model has no dry friction of which there could be less at rest, but it may get some."""
     sources = effect_sources(only=["velocity_strengthening", "coulomb_friction"])

@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from hannes_description.model import Model
 from hannes_lab.diagnosis import Fall
+from hannes_lab.directions import never_turns
 from hannes_lab.fit import Fit, nuisance_table
 from hannes_lab.problem import nuisance_coordinate
 from hannes_lab.rig import Nuisance
 from hannes_lab.search import Candidate
 from hannes_lab.trials import Closure, Trial
-from hannes_lab.wording import _one_way, notes, unmoved, worse_fitted
+from hannes_lab.wording import _one_way, notes, phase_moves, unmoved, worse_fitted
 
 
 def test_a_condition_that_is_alone_in_its_direction_is_told() -> None:
@@ -39,6 +40,31 @@ def test_a_condition_that_is_alone_in_its_direction_is_told() -> None:
     up = replace(trial, closures=tuple(closure for closure in closures if closure.condition == "up"))
     (said,) = _one_way([up])
     assert said.startswith("every condition goes the same way")
+    assert never_turns([up]) and not never_turns([trial])
+    assert not never_turns([both]), "a lap goes back"
+    swings = replace(up, signals={"encoder_position": (ticks, place + 0.1 * np.sin(20.0 * ticks))})
+    assert not never_turns([swings]), "it comes back on its way"
+
+
+def test_a_wave_of_another_phase_in_each_condition_is_told() -> None:
+    """A real motor's ripple of the right amplitude was dropped for a phase that the log's angles did not hold."""
+
+    def said(name: str, *there: tuple[float, float]) -> str:
+        z = {f"{name}.sine": 3.0, f"{name}.cosine": 0.0}
+        parameters = [
+            SimpleNamespace(name=own, vanishing=None if own == "period" else 0.0, period=own == "period")
+            for own in ("sine", "cosine", "period")
+        ]
+        kind = SimpleNamespace(parameters=parameters if name == "cogging" else parameters[:2])
+        search: Any = SimpleNamespace(effect=lambda _: kind)
+        found: Any = SimpleNamespace(names=(name,), fit=SimpleNamespace(z_of=z.get))
+        left_out = {str(k): dict(zip(z, one, strict=True)) for k, one in enumerate(there)}
+        return phase_moves(search, found, cast(Any, SimpleNamespace(left_out=left_out)))
+
+    assert "its phase moves by up to 1.6 rad" in said("cogging", (3.0, 0.1), (0.0, 3.0))
+    assert not said("cogging", (3.0, 0.1), (3.0, -0.3)), "it stays"
+    assert not said("cogging", (3.0, 0.1), (0.0, 0.5)), "another strength is none"
+    assert not said("gravity", (3.0, 0.1), (0.0, 3.0)), "no wave"
 
 
 def test_a_tolerance_of_what_moves_nothing_is_no_result() -> None:

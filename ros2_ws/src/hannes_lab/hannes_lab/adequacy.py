@@ -161,7 +161,7 @@ def distorted(search: Search, candidate: Candidate, among: Sequence[str] | None 
             for p in search.effect(effect).parameters
             if p.sd
         }
-        if waves < 1.0 and (search.problem.rig.foreign or search.problem.discrepancy):
+        if waves < 1.0 and search.problem.of_others:
             return (
                 f"{effect}, of {waves:.1f} waves in all, would repeat nowhere: it stands for something else"
             )

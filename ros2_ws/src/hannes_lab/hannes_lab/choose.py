@@ -21,6 +21,7 @@ from .greedy import (
     largest_error,
     stands_out,
 )
+from .report_text import listed
 from .search import HOPELESS, PENALTY, Candidate, Search, key_of
 
 WORTHWHILE = 0.05
@@ -250,11 +251,11 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
         adequate = enough = False
         other_model = repeats
         left = f"what was added leaves {'no more than the machine repeats' if repeats else 'little'}, but {instead}"
-    elif enough and best.far_off and not known:
+    elif enough and not known and (doubt := _doubtful(best)):
         enough = False
         left = (
-            "what was added leaves less than half, but takes parameters far outside their tolerances, and nothing was "
-            "repeated that would tell an effect from scatter"
+            f"what was added leaves less than half, but takes {doubt}, and nothing was repeated that would tell an "
+            "effect from scatter"
         )
     elif enough and not explained and not repeats:
         left = (
@@ -264,8 +265,17 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
     elif best.names and not (adequate or enough):
         above = ", as far as it is above the repeatability" if known else ""
         left = f"of the error on conditions that were left out{above}, more than half is left"
-    alone = "" if best.names or adequate or enough else missed
+    # What was repeated, and is missed all the same, tells that something is missing.
+    alone = "" if best.names or adequate or enough or largest_error(search, best) > AS_IT_REPEATS else missed
     return replace(choice, adequate=adequate, enough=enough, left=left, alone=alone, other_model=other_model)
+
+
+def _doubtful(best: Candidate) -> str:
+    """What a fit takes beyond where it is believed without repeats, in words; empty if nothing."""
+    if best.far_off:
+        return "parameters far outside their tolerances"
+    own = [c.name for c in best.fit.at_end if c.name.partition(".")[0] in best.names]
+    return f"{listed(own)} to the end of its range" if own else ""
 
 
 def halved(first: float, last: float) -> bool:

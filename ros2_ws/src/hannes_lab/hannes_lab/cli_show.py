@@ -16,7 +16,7 @@ from .compare import Comparison, MetricRow
 from .diagnosis import Diagnosis, Fall, has_excess
 from .experiments import VISIBLE, Experiment
 from .falls import NO_REPEATS, errors_in_units, step_name
-from .report_text import NO_FINDING
+from .report_text import NO_FINDING, unsure
 
 UNFITTED = "Nothing is fitted: what parameters are off in any machine leaves such a residual too; --fitted fits them."
 
@@ -93,9 +93,9 @@ def show_diagnosis(found: Diagnosis, machine: str) -> None:
     for effect in found.effects:
         console.print(Text.assemble("\n", (effect.title, "bold"), f" ({effect.name})"))
         for name, p in effect.parameters.items():
-            note = "" if p.identified else "   not identified by these data"
+            doubt = unsure(p.identified, p.at_end)
             value, span = estimate(p.value, p.low, p.high, p.unit)
-            console.print(f"  {name} = {value}   95 %: {span}{note}")
+            console.print(f"  {name} = {value}   95 %: {span}{f'   {doubt}' if doubt else ''}")
         console.print(f"  {effect.why}")
     _show_falls(console, found, machine)
     _show_nuisances(found.nuisances)

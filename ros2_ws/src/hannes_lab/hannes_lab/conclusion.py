@@ -15,7 +15,7 @@ from .prepare import FEW
 from .report_text import UNKNOWN, listed
 from .search import Candidate, Search
 from .twins import twins
-from .wording import NAMED, Clock, far_off, far_values, nearest_sentence, unforetold
+from .wording import NAMED, Clock, explains_most, far_off, far_values, nearest_sentence, unforetold
 
 CLOCK_LEADS = 0.5
 """Part from which it is said in the summary: what is left after that may need no effect."""
@@ -69,7 +69,7 @@ class Conclusion:
         few = self.greedy and max(features.closures_of.values()) < FEW
         if not (self.effects or self.bent or (features.repeated and not choice.alone)):
             return "no_repeats"
-        if self.lost:
+        if self.greedy and explains_most(choice):
             return "not_foretold"
         if choice.other_model or not features.repeated or (self.bent and not self.effects):
             return "model_or_effect"

@@ -60,6 +60,7 @@ from .wording import (
     led_back_sentence,
     notes,
     other_clock,
+    phase_moves,
     worse_fitted,
 )
 
@@ -351,7 +352,7 @@ def _idle_at_the_end(
     """
     needed = search.problem.features.repeated and _is_needed(falls)
     if not needed and _may_be_nought(search, found, limits, falls):
-        return "by its 95 % intervals its strength may be nought"
+        return f"by its 95 % intervals its strength may be nought{phase_moves(search, found, falls[-1])}"
     before, after = falls[-2].held_out, falls[-1].held_out
     features = search.problem.features
     more = sum(features.closures_of.values()) - len(features.conditions)
@@ -464,11 +465,10 @@ def without_idle(choice: Choice, falls: tuple[Fall, ...]) -> tuple[Choice, tuple
     effect, since the form of the model is wrong anyway.  What leads a parameter back into its tolerance stays: the one
     does what the other did, and foretells the same.
     """
-    rig = choice.search.problem.rig
     keep = len(falls) - WITHOUT_EFFECT
     while keep and not _foretells(falls[: keep + WITHOUT_EFFECT]):
         keep -= 1
-    if keep == len(choice.best.names) or not (rig.foreign or choice.search.problem.discrepancy):
+    if keep == len(choice.best.names) or not choice.search.problem.of_others:
         return choice, falls
     part = choice.search.fit_of([fall.added for fall in falls[WITHOUT_EFFECT : keep + WITHOUT_EFFECT]])
     if not is_adequate(choice.search, part, choice.limits):
@@ -502,7 +502,7 @@ def _widened(search: Search, best: Candidate, limits: Chance, falls: Sequence[Fa
     """By how much intervals are wider: by the closures' scatter; on a machine of others by its conditions, too."""
     problem = search.problem
     reasons = [sway(problem, best.fit, limits)]
-    if problem.rig.foreign or problem.discrepancy:
+    if problem.of_others:
         reasons.append(strain(problem.features, best.fit, limits, falls[-1].left_out))
     return wider(*reasons)
 
@@ -562,10 +562,9 @@ def _found(
     for p in kind.parameters:
         value = best.values[f"{name}.{p.name}"]
         low, high = intervals[f"{name}.{p.name}"]
-        span = p.upper - p.lower
-        parameters[p.name] = ParameterEstimate(
-            value, low, high, p.unit, f"{name}.{p.name}" not in at_end and high - low < 0.8 * span
-        )
+        ends = f"{name}.{p.name}" in at_end
+        told = high - low < 0.8 * (p.upper - p.lower)
+        parameters[p.name] = ParameterEstimate(value, low, high, p.unit, told and not ends, ends)
     step = next((k for k, f in enumerate(falls) if f.added == name), len(falls) - 1)
     pairs = zip(falls[step - 1].signals, falls[step].signals, strict=True)
     b, s = min(pairs, key=lambda pair: _change(*pair))

@@ -21,7 +21,7 @@ from .search import Candidate
 class ParameterEstimate:
     """Value and 95 % interval.
 
-    Identified is False where the value lies on its bound or the interval spans the range.
+    Identified is False where the value lies on its bound (`at_end`) or the interval spans the range.
     """
 
     value: float
@@ -29,6 +29,7 @@ class ParameterEstimate:
     high: float
     unit: str
     identified: bool
+    at_end: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         return self.__dict__.copy()

@@ -239,6 +239,11 @@ class Problem:
     def failures(self) -> int:
         return self.counts.failures
 
+    @property
+    def of_others(self) -> bool:
+        """Whether the recordings are of a machine that no model has the form of."""
+        return self.rig.foreign or bool(self.discrepancy)
+
     @cached_property
     def failed(self) -> float:
         """The whitened residual of a simulation that diverged; see WORSE."""

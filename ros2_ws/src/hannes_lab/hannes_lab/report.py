@@ -601,7 +601,7 @@ def effects(diagnosis: Part | None) -> list[dict[str, Any]]:
         parameters = [
             {
                 "name": name,
-                "identified": p.get("identified", True),
+                "unsure": text.unsure(p.get("identified", True), p.get("at_end", False)),
                 **text.interval(p.get("value"), p.get("low"), p.get("high"), p.get("unit", "")),
             }
             for name, p in effect.get("parameters", {}).items()

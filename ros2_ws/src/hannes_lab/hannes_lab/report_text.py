@@ -25,6 +25,12 @@ nothing brings what was left out nearer, or where something was recorded once an
 repeats.
 """
 
+
+def unsure(identified: bool, at_end: bool) -> str:
+    """What is to be said of an estimate that the data do not tell; empty if they do."""
+    return "" if identified else "at the end of its range" if at_end else "not identified by these data"
+
+
 NO_FINDING = "These effects come nearest. They are no finding, whatever their intervals: more is missing."
 
 

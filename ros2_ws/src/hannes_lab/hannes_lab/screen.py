@@ -9,6 +9,7 @@ import numpy as np
 from hannes_description.model import Model
 from hannes_sim.effect import EffectType, load_effect
 
+from .directions import never_turns
 from .prepare import Prepared
 from .problem import vanishing_entry
 
@@ -34,6 +35,10 @@ def usable_effects(prepared: Prepared, sources: Mapping[str, str]) -> Usable:
     without = prepared.rig.without
     notes = [f"{name} is not considered: {without[name]}" for name in sources if name in without]
     offered = {name: source for name, source in sources.items() if name not in without}
+    if never_turns(prepared.features.trials):
+        turning = [name for name, source in offered.items() if load_effect(source).both_ways]
+        notes += [f"{name} is not considered: every condition goes the same way" for name in turning]
+        offered = {name: source for name, source in offered.items() if name not in turning}
     silent = silent_effects(prepared, offered)
     if silent:
         notes.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,14 +12,16 @@ import numpy as np
 from .adequacy import disbelieved, waves_of
 from .choose import Choice, can_be_held_out, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
-from .diagnosis import Fall, FoundEffect
+from .diagnosis import Fall, FoundEffect, Rank
+from .directions import ways
 from .experiments import VISIBLE, Experiment
 from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, deciding_errors, left_out_errors
 from .fit import Fit, fit
 from .problem import Coordinate, Problem, nuisance_coordinate
 from .rig import Nuisance
+from .scan import period_of
 from .search import FAR, PENALTY, Candidate, Search, key_of
-from .trials import Trial, curves_of
+from .trials import Trial
 
 ANY_DIFFERENCE = (
     "a difference of any size counts here that chance does not explain; no simple model of a real machine is that "
@@ -48,9 +51,6 @@ HELD = 0.01
 
 SHOWN_WAVES = 2.0
 """Waves within the way below which it is worth a note that a ripple has not been seen to repeat."""
-
-ONE_WAY = 0.8
-"""Part of its range that a machine is away at the end of a condition from where it began, if that goes one way."""
 
 MOST = 0.75
 """Part of the excess misfit that an effect explains alone from which it is worth a note where it does not join."""
@@ -180,28 +180,48 @@ def _some(names: Sequence[str]) -> str:
 
 def _one_way(trials: Sequence[Trial]) -> list[str]:
     """Of conditions that each go one way: which one is alone in its direction, which no other one foretells."""
-    ways: dict[str, float] = {}
-    for trial in trials:
-        own = np.arange(trial.reference.size, dtype=np.float64) * trial.period, trial.reference
-        time, place = trial.signals.get("encoder_position", own)
-        for condition in trial.conditions:
-            curve = np.median(curves_of(trial.of(condition), time, place), axis=0)
-            net = float(curve[-1] - curve[0])
-            ways[condition] = float(np.sign(net)) if abs(net) > ONE_WAY * float(np.ptp(curve)) else 0.0
-    if 0.0 in ways.values():
+    found = ways(trials)
+    if 0.0 in found.values():
         return []
-    if len(set(ways.values())) == 1:
+    if len(set(found.values())) == 1:
         return [
             "every condition goes the same way: a constant force, Coulomb friction and one that depends on the "
             "direction are the same thing here; record a move back"
         ]
-    alone = [name for name, way in ways.items() if list(ways.values()).count(way) == 1]
+    alone = [name for name, way in found.items() if list(found.values()).count(way) == 1]
     return [
         f"'{name}' is the only condition that goes its way: what acts in that direction alone is not foretold from the "
         "others, so that an effect of it cannot be confirmed; record another amplitude or speed each way, or make one "
         "condition of both"
         for name in alone[:1]
     ]
+
+
+TURNED = 0.5
+"""rad by which the phase of a wave moves when a condition is left out, from which it is told; its amplitude may fall to
+half at most."""
+
+
+def phase_moves(search: Search, found: Candidate, fall: Fall) -> str:
+    """That the last effect is a wave of another phase in each condition, in words; empty if it is not.
+
+    fall    the errors with it, with what the fits without a condition made of its strengths
+    """
+    name = found.names[-1]
+    strengths = [f"{name}.{p.name}" for p in search.effect(name).parameters if p.vanishing is not None]
+    if period_of(search.effect(name)) is None or len(strengths) != 2:
+        return ""
+    here = complex(*(found.fit.z_of(strength) or 0.0 for strength in strengths))
+    there = [complex(*(z.get(s, 0.0) for s in strengths)) for z in fall.left_out.values()]
+    if not there or here == 0.0 or min(map(abs, there)) < 0.5 * abs(here):
+        return ""
+    turned = max(abs(cmath.phase(z / here)) for z in there)
+    if turned < TURNED:
+        return ""
+    return (
+        f" (its amplitude stays, but its phase moves by up to {turned:.1f} rad when a condition is left out: is the "
+        "position that of one scale in all of them, and does the reference begin where it does?)"
+    )
 
 
 def _few_waves(search: Search, best: Candidate) -> list[str]:
@@ -238,14 +258,18 @@ def _coasting(search: Search, best: Candidate) -> list[str]:
     ]
 
 
-def unforetold(choice: Choice) -> tuple[str, ...]:
-    """A sentence on an effect that explains most of the fit's misfit alone, and yet does not join."""
+def explains_most(choice: Choice) -> Rank | None:
+    """The effect that explains most of the fit's misfit alone, and yet is not named, if there is one."""
     first = max(choice.ranking, key=lambda rank: rank.explained, default=None)
     known = choice.search.problem.features.repeated
-    if first is None or choice.best.names or not known or first.explained < MOST:
-        return ()
-    if first.names[0] in choice.taken_back:
-        return ()  # with it they were foretold better
+    return None if first is None or choice.best.names or not known or first.explained < MOST else first
+
+
+def unforetold(choice: Choice) -> tuple[str, ...]:
+    """A sentence on an effect that explains most of the fit's misfit alone, and yet does not join."""
+    first = explains_most(choice)
+    if first is None or first.names[0] in choice.taken_back:
+        return ()  # with what was taken back they were foretold better
     names = " + ".join(first.names)
     return (
         f"{names} alone explains {100 * first.explained:.0f} % of the excess misfit of a fit to all conditions, but "

@@ -102,6 +102,7 @@ class Effect:
                 recording has to be simulated in turn
     law_below   (parameter, part of the machine's travel) below which it is no more than how the law of any other
                 machine sets in, which this simulator leaves out: there it is told, but not named as missing
+    both_ways   True where it compares the two directions: a machine that never turns back does not show it
     looks_like  one sentence: what it looks like in the data
     told_by     one sentence: the experiment that shows it best
 
@@ -117,6 +118,7 @@ class Effect:
     states: ClassVar[int] = 0
     memory: ClassVar[bool] = False
     law_below: ClassVar[tuple[str, float] | None] = None
+    both_ways: ClassVar[bool] = False
     looks_like: ClassVar[str] = ""
     told_by: ClassVar[str] = ""
 

@@ -22,6 +22,7 @@ class DirectionDependentFriction(Effect):
             "viscous", "N.m.s/rad", -0.005, 0.005, 5e-4, 0.0, "half the difference of viscous friction b"
         ),
     )
+    both_ways = True
     looks_like = "the current is too high in one direction and too low in the other"
     told_by = "closing and opening at two speeds, signed current"
 
