@@ -1,10 +1,13 @@
 """Whether what a set of effects does is believed."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 from hannes_description.model import Model
-from hannes_lab.adequacy import distorted, exaggerated, in_the_law, leads_back, led_off
+from hannes_lab.adequacy import distorted, exaggerated, in_the_law, leads_back, led_off, unshown
 from hannes_lab.diagnose import effect_sources
 from hannes_lab.fit import Fit
 from hannes_lab.hide import make_set
@@ -49,6 +52,23 @@ def test_effects_that_take_a_known_parameter_far_off_replace_what_the_model_had(
     assert last.startswith("current_sensor would take friction.coulomb to")
     assert not led_off(base, candidate((dry, -3.5), (wire, 6.0)))
     assert not led_off(candidate((dry, -3.5)), candidate((dry, -9.0))), "it was off before"
+
+
+def test_a_wave_that_the_way_does_not_show_repeat_is_believed_where_it_is_all_that_is_missing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An oval encoder and an eccentric pulley (no catalogue) were ripples of 1.9 and 2.3 waves, and much was left."""
+    (dry,) = (nuisance_coordinate(Nuisance("friction.coulomb", 0.02, 0.1, True)),)
+    found, waves = candidate((dry, 0.0)), [2.3]
+    monkeypatch.setattr("hannes_lab.adequacy.waves_of", lambda *args: waves[0])
+    others: Any = SimpleNamespace(problem=SimpleNamespace(of_others=True))
+    assert unshown(others, found, 1.6).startswith("cogging, of 2.3 waves in all, would leave 1.60 times")
+    assert not unshown(others, found, 1.2), "no more than the machine repeats"
+    assert not unshown(others, found, float("nan"))
+    own: Any = SimpleNamespace(problem=SimpleNamespace(of_others=False))
+    assert not unshown(own, found, 1.6), "of its own simulator chance says what is left"
+    waves[0] = 4.0
+    assert not unshown(others, found, 1.6)
 
 
 def test_an_effect_that_is_bent_into_another_one_explains_nothing() -> None:

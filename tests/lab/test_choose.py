@@ -155,7 +155,7 @@ def test_an_effect_at_the_end_of_its_range_is_no_answer_without_repeats(
     fit: Any = SimpleNamespace(at_end=[SimpleNamespace(name=at_end)], off=[], model=SimpleNamespace(names=()))
     best = cast(Any, SimpleNamespace(names=("brush_drop",), fit=fit, far_off=False, penalised=1.0))
     monkeypatch.setattr(module, "is_adequate", lambda *args: False)
-    for quiet in ("stands_out", "disbelieved", "led_off"):
+    for quiet in ("stands_out", "disbelieved", "led_off", "unshown"):
         monkeypatch.setattr(module, quiet, lambda *args: "")
     monkeypatch.setattr(module, "shortfall", lambda *args: "misfit")
     search: Any = SimpleNamespace(problem=SimpleNamespace(features=SimpleNamespace(repeated=repeated)))
@@ -241,7 +241,7 @@ def test_what_was_asked_of_the_nearest_effect_is_said(given: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("why", ["", "a would take friction.coulomb far off"])
-@pytest.mark.parametrize("reason", ["disbelieved", "led_off"])
+@pytest.mark.parametrize("reason", ["disbelieved", "led_off", "unshown"])
 def test_effects_that_only_replace_what_the_model_had_are_no_answer(
     given: pytest.MonkeyPatch, why: str, reason: str
 ) -> None:
@@ -252,6 +252,7 @@ def test_effects_that_only_replace_what_the_model_had_are_no_answer(
     given.setattr(module, "stands_out", lambda *args: "")
     given.setattr(module, "disbelieved", lambda search, c: why if reason == "disbelieved" else "")
     given.setattr(module, "led_off", lambda base, c: why if reason == "led_off" else "")
+    given.setattr(module, "unshown", lambda search, c, error: why if reason == "unshown" else "")
     choice = choose_greedily(search_of(NULL, best), NULL, LIMITS, 3)
     assert choice.enough == choice.adequate == (not why)
     assert (why in choice.left and "no more than the machine repeats" in choice.left) == bool(why)

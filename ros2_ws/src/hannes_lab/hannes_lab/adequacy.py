@@ -40,6 +40,11 @@ usual of them where fewer than so many of its waves fit into the travel: bent fu
 not repeat.  Waves that repeat may have any form: of the ripple of EMPS, 98 waves, the third harmonic is as large as the
 first.  Where not even one wave fits in, nothing repeats, and another machine's form is nearer than a ripple."""
 
+AS_IT_REPEATS = 1.25
+"""An error on held-out conditions, in multiples of the repeatability, that leaves nothing to look for on a real
+machine: chance makes it 1, and up to this where five repeats differ by one parameter, such as their friction (95 % of
+(4 + chi-square of one degree) / 5, root).  What a model of the right form has of its own is less than its repeats."""
+
 
 def is_adequate(search: Search, candidate: Candidate, limits: Chance, room: float = ADEQUATE) -> bool:
     """Whether chance, with the model's own error if it has one, explains what a set leaves."""
@@ -99,6 +104,25 @@ def exaggerated(search: Search, candidate: Candidate) -> str:
                     f"{name} would be {candidate.fit.values[name]:.3g} {p.unit}, {strength:.0f} times what is "
                     "typical: it stands for something else"
                 )
+    return ""
+
+
+def unshown(search: Search, candidate: Candidate, error: float) -> str:
+    """The wave of a set that the way is too short to show repeat, where more is left than repeats leave, in words.
+
+    On a machine of others only; empty if there is none.  One of fewer than WAVES waves may stand for any curve of the
+    position: it is believed where it is all that is missing.
+
+    error   on what took no part in the fit, in multiples of the repeatability
+    """
+    if not (search.problem.of_others and error > AS_IT_REPEATS):
+        return ""
+    for effect in candidate.names:
+        if (waves := waves_of(search, candidate, effect)) < WAVES:
+            return (
+                f"{effect}, of {waves:.1f} waves in all, would leave {error:.2f} times the repeatability: the way does "
+                "not show that it repeats, and it may stand for another curve of the position"
+            )
     return ""
 
 

@@ -8,12 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from hannes_description.errors import HannesError
 
-from .adequacy import disbelieved, distorted, is_adequate, leads_back, led_off, shortfall
+from .adequacy import (
+    AS_IT_REPEATS,
+    disbelieved,
+    distorted,
+    is_adequate,
+    leads_back,
+    led_off,
+    shortfall,
+    unshown,
+)
 from .chance import Chance, chance
 from .diagnosis import Rank
 from .features import Features
 from .greedy import (
-    AS_IT_REPEATS,
     JUDGED,
     as_it_repeats,
     grown_straight,
@@ -246,7 +254,11 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
         and (last <= AS_IT_REPEATS or (not best.names and largest_error(search, best) <= AS_IT_REPEATS))
     )
     enough = repeats or (bool(best.names) and (halved(first, last) if known else last <= HALF * first))
-    instead = (disbelieved(search, best) or led_off(null, best)) if best.names else ""
+    instead = ""
+    if best.names:
+        instead = (
+            disbelieved(search, best) or led_off(null, best) or (unshown(search, best, last) if known else "")
+        )
     if enough and instead:
         adequate = enough = False
         other_model = repeats

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from .adequacy import distorted
+from .adequacy import AS_IT_REPEATS, distorted
 from .errors import apart_alone, condition_error, held_out_condition_errors, per_signal, signal_errors
 from .report_text import listed, words
 from .search import Candidate, Search
@@ -27,11 +27,6 @@ same thing on a machine (a friction by a load that is constant, and Coulomb fric
 
 POLISH_STEPS = 40
 """Limit on the steps of the last fit of each of them: valleys of friction laws are long."""
-
-AS_IT_REPEATS = 1.25
-"""An error on held-out conditions, in multiples of the repeatability, that leaves nothing to look for on a real
-machine: chance makes it 1, and up to this where five repeats differ by one parameter, such as their friction (95 % of
-(4 + chi-square of one degree) / 5, root).  What a model of the right form has of its own is less than its repeats."""
 
 ALIKE = 0.02
 """Candidates whose held-out error is this close to the best, as a part of it, tie with it."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .adequacy import disbelieved, waves_of
+from .adequacy import disbelieved, unshown, waves_of
 from .choose import Choice, can_be_held_out, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect, Rank
@@ -70,9 +70,12 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
 
     Where a set of effects takes a machine far outside its tolerances as well, and the error on what took no part in the
     fit does not fall to half of what it is above the repeatability, the effects only help to bend the model.  Where the
-    model alone does so, and leaves more than LEFT, something of the same form may be missing: nobody can tell.
+    model alone does so, and leaves more than LEFT, something of the same form may be missing: nobody can tell.  Nor
+    does a wave of which the way shows too little, see unshown.
     """
     best, before, after = choice.best, falls[NOMINAL_FITTED], falls[-1]
+    if why := unshown(choice.search, best, after.held_out):
+        return why
     if not (best.far_off and choice.search.problem.discrepancy):
         return ""
     if not best.names:
