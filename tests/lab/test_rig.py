@@ -341,6 +341,16 @@ def test_what_compares_the_directions_is_not_offered_to_a_machine_that_goes_one_
     assert "direction_dependent_friction is not considered: every condition goes the same way" in usable.notes
 
 
+def test_of_a_ripple_that_the_model_has_no_second_one_is_looked_for_and_that_is_said(
+    prepared: Prepared,
+) -> None:
+    model = prepared.model.with_effect(load_effect("cogging").entry())
+    usable = usable_effects(
+        replace(prepared, model=model), effect_sources(only=["coulomb_friction"], model=model)
+    )
+    assert usable.notes[0].startswith("cogging is in the model already: a second one")
+
+
 def test_an_effect_that_acts_on_another_is_offered(prepared: Prepared) -> None:
     """The model has no dry friction of which there could be less at rest, but it may get some."""
     sources = effect_sources(only=["velocity_strengthening", "coulomb_friction"])

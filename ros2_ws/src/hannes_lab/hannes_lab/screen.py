@@ -12,6 +12,7 @@ from hannes_sim.effect import EffectType, load_effect
 from .directions import never_turns
 from .prepare import Prepared
 from .problem import vanishing_entry
+from .scan import period_of
 
 MOVES = 1e-6
 """Least change of the whitened prediction (root of the sum of squares) that counts as movement."""
@@ -39,6 +40,12 @@ def usable_effects(prepared: Prepared, sources: Mapping[str, str]) -> Usable:
         turning = [name for name, source in offered.items() if load_effect(source).both_ways]
         notes += [f"{name} is not considered: every condition goes the same way" for name in turning]
         offered = {name: source for name, source in offered.items() if name not in turning}
+    notes += [
+        f"{effect.name} is in the model already: a second one, of another period, is not looked for (give one as an "
+        "effect of your own)"
+        for effect in prepared.model.effects
+        if period_of(load_effect(effect.source or effect.name))
+    ]
     silent = silent_effects(prepared, offered)
     if silent:
         notes.append(
