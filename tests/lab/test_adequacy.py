@@ -57,7 +57,7 @@ def test_effects_that_take_a_known_parameter_far_off_replace_what_the_model_had(
 def test_a_wave_that_the_way_does_not_show_repeat_is_believed_where_it_is_all_that_is_missing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An oval encoder and an eccentric pulley (no catalogue) were ripples of 1.9 and 2.3 waves, and much was left."""
+    """An oval encoder and an eccentric pulley (no catalogue) were ripples of 1.9 and 2.1 waves, and much was left."""
     (dry,) = (nuisance_coordinate(Nuisance("friction.coulomb", 0.02, 0.1, True)),)
     found, waves = candidate((dry, 0.0)), [2.3]
     monkeypatch.setattr("hannes_lab.adequacy.waves_of", lambda *args: waves[0])
