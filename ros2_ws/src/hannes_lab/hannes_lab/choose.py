@@ -262,7 +262,8 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
     if enough and instead:
         adequate = enough = False
         other_model = repeats
-        left = f"what was added leaves {'no more than the machine repeats' if repeats else 'less than half'}, but {instead}"
+        leaves = "no more than the machine repeats" if repeats else "less than half"
+        left = f"what was added leaves {leaves}, but {instead}"
     elif enough and not known and (doubt := _doubtful(best)):
         enough = False
         left = (
