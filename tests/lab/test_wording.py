@@ -56,7 +56,7 @@ def test_a_wave_of_another_phase_in_each_condition_is_told() -> None:
             for own in ("sine", "cosine", "period")
         ]
         kind = SimpleNamespace(parameters=parameters if name == "cogging" else parameters[:2])
-        search: Any = SimpleNamespace(effect=lambda _: kind)
+        search: Any = SimpleNamespace(effect=lambda _: kind, strengths=lambda _: list(z))
         found: Any = SimpleNamespace(names=(name,), fit=SimpleNamespace(z_of=z.get))
         left_out = {str(k): dict(zip(z, one, strict=True)) for k, one in enumerate(there)}
         return phase_moves(search, found, cast(Any, SimpleNamespace(left_out=left_out)))

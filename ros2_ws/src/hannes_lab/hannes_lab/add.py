@@ -8,7 +8,7 @@ from typing import Any
 
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
-from hannes_sim.effect import load_effect
+from hannes_sim.effect import is_own_effect, load_effect
 from hannes_sim.plant import PlantDiverged
 
 from .chance import chance
@@ -119,7 +119,7 @@ def check_effects(prepared: Prepared, sources: Mapping[str, str]) -> None:
     """Refuse an effect with which the plant diverges at its typical values; HannesError names it."""
     for name, source in sources.items():
         kind = prepared.rig.effect(load_effect(source))
-        model = prepared.model.with_effect(kind.entry(source=source if ":" in source else None))
+        model = prepared.model.with_effect(kind.entry(source=source if is_own_effect(source) else None))
         for trial in prepared.rig.trials:
             try:
                 prepared.rig.simulate(model, {}, trial, trial.reference[: round(5.0 / trial.period)])

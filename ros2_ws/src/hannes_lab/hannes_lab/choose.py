@@ -248,11 +248,9 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
     explained = is_adequate(search, best, choice.limits)
     adequate = explained and (known or not best.names)
     missed = stands_out(search, best) if known else ""
-    repeats = (
-        known
-        and not missed
-        and (last <= AS_IT_REPEATS or (not best.names and largest_error(search, best) <= AS_IT_REPEATS))
-    )
+    # Of the fitted nominal model its errors in the fit count too.
+    fits = known and not best.names and largest_error(search, best) <= AS_IT_REPEATS
+    repeats = known and not missed and (last <= AS_IT_REPEATS or fits)
     enough = repeats or (bool(best.names) and (halved(first, last) if known else last <= HALF * first))
     instead = ""
     if best.names:
@@ -279,7 +277,7 @@ def judged_by_conditions(choice: Choice, null: Candidate, first: float, last: fl
         above = ", as far as it is above the repeatability" if known else ""
         left = f"of the error on conditions that were left out{above}, more than half is left"
     # What was repeated, and is missed all the same, tells that something is missing.
-    alone = "" if best.names or adequate or enough or largest_error(search, best) > AS_IT_REPEATS else missed
+    alone = missed if fits and not (adequate or enough) else ""
     return replace(choice, adequate=adequate, enough=enough, left=left, alone=alone, other_model=other_model)
 
 
@@ -356,9 +354,8 @@ def _settled(choice: Choice) -> str:
     """
     search, best = choice.search, choice.best
     judged = search.problem.discrepancy and is_adequate(search, best, choice.limits)
-    if not judged or stands_out(search, best):
-        return ""
-    return as_it_repeats(search, best)
+    why = as_it_repeats(search, best) if judged else ""
+    return "" if why and stands_out(search, best) else why
 
 
 def scatter_is_a_guess(search: Search) -> bool:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import EffectEntry, Model
-from hannes_sim.effect import catalogue, effect_source, load_effect
+from hannes_sim.effect import catalogue, effect_source, is_own_effect, load_effect
 from numpy.typing import NDArray
 
 from .adequacy import in_the_law, is_adequate, leads_back, led_off
@@ -98,7 +98,7 @@ def effect_sources(
         kind = load_effect(given)
         name = kind.name
         if load_effect(out.setdefault(name, given)) is not kind:
-            first = out[name] if ":" in out[name] else f"the catalogue's {name}"
+            first = out[name] if is_own_effect(out[name]) else f"the catalogue's {name}"
             raise HannesError(
                 f"Two effects are named '{name}': {first} and {given}. Give yours a name of its own, or leave the "
                 'other one out (--only, on the page "Diagnose with these only", names the effects that take part).'
@@ -397,8 +397,7 @@ def _needed_sentence(name: str, falls: Sequence[Fall], few: bool) -> str:
 
 def _may_be_nought(search: Search, found: Candidate, limits: Chance, falls: Sequence[Fall]) -> bool:
     """Whether all strengths of the last effect may be nought together, by 95 %."""
-    name = found.names[-1]
-    strengths = [f"{name}.{p.name}" for p in search.effect(name).parameters if p.vanishing is not None]
+    strengths = search.strengths(found.names[-1])
     return may_vanish(found.fit, limits, _widened(search, found, limits, falls), strengths)
 
 

@@ -18,24 +18,25 @@ BACK = 0.02
 
 def ways(trials: Sequence[Trial]) -> dict[str, float]:
     """1 or -1 for each condition that ends far from where it began, 0 for one that comes back."""
-    out = {}
-    for condition, curve in _curves(trials):
-        net = float(curve[-1] - curve[0])
-        out[condition] = float(np.sign(net)) if abs(net) > ONE_WAY * float(np.ptp(curve)) else 0.0
-    return out
+    return {condition: _way(curve) for condition, curve in _curves(trials)}
 
 
 def never_turns(trials: Sequence[Trial]) -> bool:
     """Whether all conditions go the same way and none ever comes back: then nothing tells one direction's friction."""
-    found = set(ways(trials).values())
-    if len(found) != 1 or 0.0 in found:
-        return False
-    (way,) = found
-    for _, curve in _curves(trials):
-        ahead = curve * way
-        if float((np.maximum.accumulate(ahead) - ahead).max()) > BACK * float(np.ptp(curve)):
-            return False
-    return True
+    curves = [curve for _, curve in _curves(trials)]
+    found = {_way(curve) for curve in curves}
+    return len(found) == 1 and 0.0 not in found and all(_comes_back(curve) <= BACK for curve in curves)
+
+
+def _way(curve: NDArray[np.float64]) -> float:
+    net = float(curve[-1] - curve[0])
+    return float(np.sign(net)) if abs(net) > ONE_WAY * float(np.ptp(curve)) else 0.0
+
+
+def _comes_back(curve: NDArray[np.float64]) -> float:
+    """How far a curve comes back from the farthest that it had been on its way to its end, as a part of its range."""
+    ahead = curve * np.sign(curve[-1] - curve[0])
+    return float((np.maximum.accumulate(ahead) - ahead).max()) / float(np.ptp(curve))
 
 
 def _curves(trials: Sequence[Trial]) -> Iterator[tuple[str, NDArray[np.float64]]]:

@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 from hannes_description.errors import HannesError
-from hannes_sim.effect import ContributeFailed, EffectType, compile_effect, load_effect
+from hannes_sim.effect import ContributeFailed, EffectType, compile_effect, is_own_effect, load_effect
 from hannes_sim.ports import DT, N_INPUTS, N_OUTPUTS, QL, RESISTANCE, SUPPLY, VL, Q, T, V
 from numpy.typing import NDArray
 
@@ -37,7 +37,7 @@ def check_own_effects(
     Raises one HannesError that says what is wrong with the effect.
     """
     for source in sources:
-        if ":" in source:
+        if is_own_effect(source):
             _check(source, simulate, motion, limit)
 
 

@@ -22,7 +22,7 @@ from hannes_description.control_ports import (
 )
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
-from hannes_sim.effect import NEEDS_PYTHON, call_own
+from hannes_sim.effect import NEEDS_PYTHON, call_own, is_own_effect
 from hannes_sim.native import call_control, needs_python
 from hannes_sim.plant import PlantDiverged
 from hannes_sim.raised import watched
@@ -52,7 +52,7 @@ _OTHERS = (0.0, math.nan, -1e6)
 def check_own_code(rig: PlantRig, model: Model) -> None:
     """Try the control law and the effects that a model file brings, before anything is simulated with them here."""
     check_own_law(rig, model)
-    own = [effect.source for effect in model.effects if effect.source and ":" in effect.source]
+    own = [effect.source for effect in model.effects if effect.source and is_own_effect(effect.source)]
     trial, reference = first_closure(rig.trials)
     check_own_effects(
         own, lambda _: rig.simulate(model, {}, trial, reference), along_reference(trial, reference)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from hannes_description.model import Model
-from hannes_sim.effect import EffectType, load_effect
+from hannes_sim.effect import EffectType, is_own_effect, load_effect
 
 from .directions import never_turns
 from .prepare import Prepared
@@ -85,7 +85,7 @@ def _moving(prepared: Prepared, sources: Mapping[str, str], other: str | None = 
 def _with(prepared: Prepared, model: Model, source: str) -> Model:
     """The model with an effect that is switched off."""
     kind = prepared.rig.effect(load_effect(source))
-    return model.with_effect(vanishing_entry(kind, source if ":" in source else None))
+    return model.with_effect(vanishing_entry(kind, source if is_own_effect(source) else None))
 
 
 def _switched_on(kind: EffectType) -> dict[str, float]:

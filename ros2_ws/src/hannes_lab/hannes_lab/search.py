@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from hannes_description.model import Model
-from hannes_sim.effect import EffectType, load_effect
+from hannes_sim.effect import EffectType, is_own_effect, load_effect
 from numpy.typing import NDArray
 
 from .cache import Codec, NotPlain, Store, code_hash, content_hash
@@ -175,7 +175,11 @@ class Search:
 
     def own(self, name: str) -> bool:
         """Whether an effect is the user's, and not of the catalogue."""
-        return ":" in self.sources[name]
+        return is_own_effect(self.sources[name])
+
+    def strengths(self, name: str) -> list[str]:
+        """The full names of an effect's parameters that switch it off where they vanish."""
+        return [f"{name}.{p.name}" for p in self.effect(name).parameters if p.vanishing is not None]
 
     def null(self) -> Candidate:
         """The model as it is, with its nuisance parameters fitted."""
@@ -347,8 +351,7 @@ class Search:
             best = min(best, self._carried_on(best, worth), key=lambda f: f.cost)
         if best.cost > base.fit.cost:
             # The set contains the base: the search was led astray, and starts again from where the base is.
-            strengths = {f"{name}.{p.name}" for p in self.effect(name).parameters if p.vanishing is not None}
-            at = {**starts[0], **base.fit.point, **dict.fromkeys(strengths, 0.0)}
+            at = {**starts[0], **base.fit.point, **dict.fromkeys(self.strengths(name), 0.0)}
             again = fit(
                 seen_from(self.problem, base.fit),
                 best.model,

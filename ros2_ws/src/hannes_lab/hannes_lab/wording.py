@@ -211,7 +211,7 @@ def phase_moves(search: Search, found: Candidate, fall: Fall) -> str:
     fall    the errors with it, with what the fits without a condition made of its strengths
     """
     name = found.names[-1]
-    strengths = [f"{name}.{p.name}" for p in search.effect(name).parameters if p.vanishing is not None]
+    strengths = search.strengths(name)
     if period_of(search.effect(name)) is None or len(strengths) != 2:
         return ""
     here = complex(*(found.fit.z_of(strength) or 0.0 for strength in strengths))

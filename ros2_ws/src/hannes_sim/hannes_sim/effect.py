@@ -244,7 +244,7 @@ def _offered(point: EntryPoint, found: Mapping[str, EffectType]) -> EffectType:
 @lru_cache(maxsize=256)
 def load_effect(name_or_source: str) -> EffectType:
     """An effect by catalogue name, or a user's own by `path.py:Class` (the file is executed, as any import is)."""
-    if ":" not in name_or_source:
+    if not is_own_effect(name_or_source):
         found = catalogue()
         if name_or_source not in found:
             near = get_close_matches(name_or_source, found, 1)
@@ -429,12 +429,17 @@ def evaluate(
     return y
 
 
+def is_own_effect(given: str) -> bool:
+    """Whether a name or path.py:Class is the user's own effect, and not one of the catalogue."""
+    return ":" in given
+
+
 def effect_source(given: str) -> str | None:
     """What a model file stores so that the effect is found again.
 
     None for the catalogue, else an absolute path:Class.
     """
-    if ":" not in given:
+    if not is_own_effect(given):
         return None
     file, _, class_name = given.rpartition(":")
     return f"{Path(file).expanduser().resolve()}:{class_name}"
