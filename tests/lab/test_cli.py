@@ -57,6 +57,41 @@ def test_trials(bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pyt
     assert code == 2 and "No bag 'nowhere'" in err
 
 
+def test_named_closures_are_left_out(
+    bags: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def starts(*options: str) -> list[float]:
+        code, out, _ = hannes("trials", str(bags), "--json", *options, capsys=capsys, monkeypatch=monkeypatch)
+        assert code == 0
+        slow = next(t for t in json.loads(out)["trials"] if t["name"] == "slow")
+        return slow["conditions"][0]["starts"]
+
+    whole = starts()
+    assert starts("--leave-out", "slow=1", "--leave-out", "slow=4,2") == [whole[2], *whole[4:]]
+    _, out, _ = hannes("compare", str(bags), "--leave-out", "slow=1", capsys=capsys, monkeypatch=monkeypatch)
+    assert "left out, as asked for: closure 1 of 'slow', at 0.5 s" in " ".join(out.split())
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    (
+        ("slow", "give CONDITION=NUMBER"),
+        ("slow=0", "the first closure is 1"),
+        ("slow=one", "give CONDITION=NUMBER"),
+        ("slwo=1", "unknown condition 'slwo'; these recordings have fast, grasp, slow"),
+        ("slow=7", "'slow' has 6 closures only"),
+        ("slow=1,2,3,4,5,6", "leaves no closure of 'slow'"),
+    ),
+)
+def test_closures_that_are_not_there_cannot_be_left_out(
+    bags: Path, given: str, said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, out, err = hannes(
+        "compare", str(bags), "--leave-out", given, capsys=capsys, monkeypatch=monkeypatch
+    )
+    assert code == 2 and not out and said in " ".join(err.split())
+
+
 @pytest.mark.parametrize("count", [1, 3, 9])
 def test_the_error_of_each_condition_is_a_table_of_its_own(
     count: int, capsys: pytest.CaptureFixture[str]

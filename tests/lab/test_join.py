@@ -16,7 +16,7 @@ from hannes_lab.features import build_features, compact_end
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
 from hannes_lab.join import ENOUGH, Loaded, join_repeats
-from hannes_lab.prepare import load_trials, prepare
+from hannes_lab.prepare import load_trials, prepare, without_named
 from hannes_lab.trials import SAME, make_trial
 from hannes_sim.effect import strength_of
 from lab.foreign_bags import hannes
@@ -110,6 +110,9 @@ def test_recordings_that_begin_anew_and_repeat_nearly_are_simulated_one_by_one_o
         alone.append(replace(trial, name=f"fast_{k}", reference=by_hand, source="", fresh=True))
     (joined,) = join_repeats([Loaded(trial, "fast") for trial in alone])
     assert joined.anew and SAME < joined.apart < 0.02
+    assert len(without_named([joined], {"fast": (CLOSURES,)})[0].closures) == CLOSURES - 1
+    with pytest.raises(HannesError, match="leave that recording out instead"):
+        without_named([joined], {"fast": (1,)})
     features, rig = build_features([joined], ["motor_current"]), HandRig([joined])
     found = features.closures(rig, model, {})[0]
     names = [part.name for part in joined.parts]

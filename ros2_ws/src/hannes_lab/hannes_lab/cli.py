@@ -24,6 +24,7 @@ from .cli_options import (
     Greedy,
     Jobs,
     Json,
+    LeaveOut,
     MaxEffects,
     ModelFile,
     NoCache,
@@ -58,6 +59,7 @@ def compare(
     objects: Objects = None,
     scale: Scale = None,
     topics: Topics = None,
+    leave_out: LeaveOut = None,
     signals: Signals = None,
     rig: RigFile = None,
     report: ReportFile = None,
@@ -69,7 +71,7 @@ def compare(
     from .session import executor_of, prepared_from
 
     check_files(report)
-    prepared = prepared_from(bags, model, objects, signals, rig, scale, JOBS, topics)
+    prepared = prepared_from(bags, model, objects, signals, rig, scale, JOBS, topics, leave_out)
     with (
         ConsoleProgress(quiet=json or not fitted) as progress,
         executor_of(JOBS, None, not fitted) as executor,
@@ -92,6 +94,7 @@ def diagnose(
     objects: Objects = None,
     scale: Scale = None,
     topics: Topics = None,
+    leave_out: LeaveOut = None,
     signals: Signals = None,
     rig: RigFile = None,
     max_effects: MaxEffects = None,
@@ -112,7 +115,7 @@ def diagnose(
         raise HannesError(f"--out {model_file}: only --add writes a model file; say --add too.")
     out = model_file or Path("my_hand.yaml")
     check_files(report, out if add else None)
-    prepared = prepared_from(bags, model, objects, signals, rig, scale, jobs, topics)
+    prepared = prepared_from(bags, model, objects, signals, rig, scale, jobs, topics, leave_out)
     try_effects(prepared, [*(only or ()), *(effects or ())])
     with ConsoleProgress(quiet=json) as progress, executor_of(jobs, dask, no_cache) as executor:
         found = diagnose_model(
@@ -138,6 +141,7 @@ def add(
     objects: Objects = None,
     scale: Scale = None,
     topics: Topics = None,
+    leave_out: LeaveOut = None,
     signals: Signals = None,
     rig: RigFile = None,
     jobs: Jobs = JOBS,
@@ -153,7 +157,7 @@ def add(
     from .session import executor_of, prepared_from, try_effects
 
     check_files(report, out)
-    prepared = prepared_from(bags, model, objects, signals, rig, scale, jobs, topics)
+    prepared = prepared_from(bags, model, objects, signals, rig, scale, jobs, topics, leave_out)
     try_effects(prepared, effects or ())
     with ConsoleProgress(quiet=json) as progress, executor_of(jobs, dask, no_cache) as executor:
         found = add_effects(
@@ -286,6 +290,7 @@ def report(
     objects: Objects = None,
     scale: Scale = None,
     topics: Topics = None,
+    leave_out: LeaveOut = None,
     signals: Signals = None,
     rig: RigFile = None,
     max_effects: MaxEffects = None,
@@ -301,7 +306,7 @@ def report(
     from .session import executor_of, prepared_from, try_effects
 
     check_files(out)
-    prepared = prepared_from(bags, model, objects, signals, rig, scale, jobs, topics)
+    prepared = prepared_from(bags, model, objects, signals, rig, scale, jobs, topics, leave_out)
     try_effects(prepared, effects or ())
     with ConsoleProgress(quiet=json) as progress, executor_of(jobs, dask, no_cache) as executor:
         found = diagnose_model(

@@ -11,7 +11,7 @@ from hannes_description.errors import HannesError
 from hannes_description.output import estimate, number, text_console
 
 from .cli_files import Output, check_model_file, deliver
-from .cli_options import Scale, Topics
+from .cli_options import LeaveOut, Scale, Topics
 from .cli_progress import ConsoleProgress
 from .interruptible import interruptible
 
@@ -40,6 +40,7 @@ def calibrate(
     ] = None,
     scale: Scale = None,
     topics: Topics = None,
+    leave_out: LeaveOut = None,
     starts: Annotated[int, typer.Option(min=1, help="Searches from different points.")] = 3,
     seed: Annotated[int, typer.Option(help="Seed of the starts.")] = 0,
     cache: Annotated[
@@ -67,7 +68,7 @@ def calibrate(
             raise HannesError(f"--prior {text}: '{name}' is not among --free.")
     with ConsoleProgress(quiet=json) as progress:
         progress(0, 1, "reading the bags")
-        prepared = prepared_from(bags, model, None, None, scale=scale, topics=topics)
+        prepared = prepared_from(bags, model, None, None, scale=scale, topics=topics, leave_out=leave_out)
         found = calibrate_model(
             prepared,
             names,

@@ -45,6 +45,13 @@ Topics = Annotated[
         f"Signals: {', '.join(('reference_position', *COMPARED))}.",
     ),
 ]
+LeaveOut = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--leave-out",
+        help="Closures that do not count, as CONDITION=NUMBER[,NUMBER...], from 1 on, as `hannes trials` shows them.",
+    ),
+]
 RigFile = Annotated[
     str | None,
     typer.Option(

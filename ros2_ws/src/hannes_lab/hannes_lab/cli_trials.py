@@ -17,7 +17,7 @@ from hannes_description.output import (
 )
 from rich.table import Table
 
-from .cli_options import Bags, Json, Objects, RigFile, Scale, Topics
+from .cli_options import Bags, Json, LeaveOut, Objects, RigFile, Scale, Topics
 
 if TYPE_CHECKING:
     from .trials import Trial
@@ -28,6 +28,7 @@ def trials(
     objects: Objects = None,
     scale: Scale = None,
     topics: Topics = None,
+    leave_out: LeaveOut = None,
     rig: RigFile = None,
     json: Json = False,
 ) -> None:
@@ -38,10 +39,10 @@ def trials(
     its rest to where it does again, the last one to the end of the recording.
     """
     from .prepare import as_compared, notes_of
-    from .session import trials_from
+    from .session import closures_named, trials_from
 
     machine, read_in = trials_from(bags, objects, rig, scale, topics)
-    found = as_compared(read_in, machine)
+    found = as_compared(read_in, machine, closures_named(leave_out))
     read = [told(trial) for trial in found]
     notes = notes_of(found)
     if json:

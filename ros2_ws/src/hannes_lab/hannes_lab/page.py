@@ -31,6 +31,7 @@ from .cli_options import (
     Bags,
     Greedy,
     Jobs,
+    LeaveOut,
     MaxEffects,
     ModelFile,
     Objects,
@@ -337,6 +338,7 @@ def page(
     objects: Objects = None,
     scale: Scale = None,
     topics: Topics = None,
+    leave_out: LeaveOut = None,
     signals: Signals = None,
     rig: RigFile = None,
     max_effects: MaxEffects = None,
@@ -354,7 +356,13 @@ def page(
     if model is not None:
         Model.load(model)  # so that a wrong name is said here, not on the page
     settings: dict[str, Any] = {"bags": [str(b) for b in bags], "model": model, "rig": rig, "jobs": jobs}
-    settings |= {"objects": objects, "scale": scale, "topics": topics, "signals": signals}
+    settings |= {
+        "objects": objects,
+        "scale": scale,
+        "topics": topics,
+        "leave_out": leave_out,
+        "signals": signals,
+    }
     settings |= {"max_effects": max_effects, "greedy": greedy}
     with tempfile.TemporaryDirectory(prefix="hannes_page_") as folder, listen(host, port) as listener:
         os.environ["NICEGUI_STORAGE_PATH"] = folder  # else NiceGUI would look for its own folder in this one

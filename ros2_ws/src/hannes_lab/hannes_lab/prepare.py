@@ -132,17 +132,65 @@ def read_trials(rig: type[PlantRig], paths: Sequence[Path]) -> list[Trial]:
 
 
 def as_compared(
-    trials: Sequence[Trial], rig: type[PlantRig] | None, *, typical: bool = False
+    trials: Sequence[Trial],
+    rig: type[PlantRig] | None,
+    leave_out: Mapping[str, Sequence[int]] | None = None,
+    *,
+    typical: bool = False,
 ) -> Sequence[Trial]:
     """Trials as they are held against a model, without closures far from the others.
 
     Those of a rig are checked; those that repeat one condition become one, with closures that begin at the same moment.
 
+    leave_out  closures that the user does not want, by condition: numbers from 1 on
     typical  closures far from the others are left out already
     """
     if rig is not None:
         trials = [trial.aligned() for trial in join_trials(check_trials(trials, rig.__name__))]
+    if leave_out:
+        trials = without_named(trials, leave_out)
     return trials if typical else [without_outliers(trial) for trial in trials]
+
+
+def without_named(trials: Sequence[Trial], given: Mapping[str, Sequence[int]]) -> list[Trial]:
+    """Leave out the closures that the user names: numbers, from 1 on, by condition."""
+    known = {name for trial in trials for name in trial.conditions}
+    for name in given:
+        if name not in known:
+            raise HannesError(
+                f"--leave-out names the unknown condition '{name}'; these recordings have {', '.join(sorted(known))}."
+            )
+    out = []
+    for trial in trials:
+        gone: set[int] = set()
+        notes = []
+        for name in given.keys() & set(trial.conditions):
+            own, numbers = trial.numbers[name], sorted(set(given[name]))
+            if numbers[-1] > len(own):
+                raise HannesError(f"--leave-out {name}={numbers[-1]}: '{name}' has {len(own)} closures only.")
+            if len(numbers) == len(own):
+                raise HannesError(
+                    f"--leave-out leaves no closure of '{name}'; leave its recordings out instead."
+                )
+            gone.update(own[number - 1] for number in numbers)
+            named = [
+                f"{n} of '{name}', at {max(trial.closures[own[n - 1]].start, 0.0):.1f} s" for n in numbers
+            ]
+            notes.append(f"left out, as asked for: closure {listed(named)}")
+        needed = {k for k in gone if _is_simulated(trial, trial.closures[k])}
+        if needed:
+            raise HannesError(
+                f"--leave-out: closure {min(needed) + 1} of '{trial.name}' is of '{trial.parts[0].source}', which the "
+                "other recordings of that condition repeat: leave that recording out instead."
+            )
+        kept = [closure for k, closure in enumerate(trial.closures) if k not in gone]
+        out.append(replace(trial, closures=tuple(kept), notes=(*trial.notes, *notes)) if gone else trial)
+    return out
+
+
+def _is_simulated(trial: Trial, closure: Closure) -> bool:
+    """Whether it is of the recording as which the others, that begin anew, are simulated: the most typical of them."""
+    return trial.anew and closure.start < trial.parts[1].begin
 
 
 def without_outliers(trial: Trial) -> Trial:
@@ -164,9 +212,7 @@ def without_outliers(trial: Trial) -> Trial:
                 distance, away / max(float(np.median(away)), 1e-3 * float(np.ptp(curves)), 1e-12)
             )
         for closure, far in zip(closures, distance, strict=True):
-            # What the others are simulated as stays: the most typical recording of those that begin anew.
-            needed = trial.anew and closure.start < trial.parts[1].begin
-            (dropped if far > OUTLIER and not needed else kept).append(closure)
+            (dropped if far > OUTLIER and not _is_simulated(trial, closure) else kept).append(closure)
         if FIRST_APART < distance[0] <= OUTLIER:
             apart[condition] = float(distance[0])
     if apart:
@@ -176,7 +222,8 @@ def without_outliers(trial: Trial) -> Trial:
         said.append(
             f"the first closure{of} {is_} {listed([f'{far:.1f}' for far in apart.values()])} times as far from the "
             f"median closure as half of them are: {it} (from {OUTLIER:g} times on one is left out) and count"
-            f"{'s' if len(apart) == 1 else ''} as scatter, and errors look small against that"
+            f"{'s' if len(apart) == 1 else ''} as scatter, and errors look small against that (--leave-out "
+            f"{next(iter(apart))}=1 leaves it out)"
         )
     if dropped:
         several = len(trial.conditions) > 1
@@ -205,6 +252,7 @@ def prepare(
     surrogate: bool = False,
     threads: int = 1,
     typical: bool = False,
+    leave_out: Mapping[str, Sequence[int]] | None = None,
 ) -> Prepared:
     """Estimate noise and scatter at the fitted nominal model.
 
@@ -213,8 +261,9 @@ def prepare(
     surrogate  search a slow plant through a fast one (surrogate.py); `rig` of the result is the exact one
     threads  among which the slow plant's simulations are divided while this process works alone
     typical  closures far from the others are left out already
+    leave_out  see as_compared
     """
-    trials = as_compared(trials, rig, typical=typical)
+    trials = as_compared(trials, rig, leave_out, typical=typical)
     made: PlantRig = (rig or HandRig)(trials)
     check_parameters(made, model)
     check_own_code(made, model)

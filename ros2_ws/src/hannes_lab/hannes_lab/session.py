@@ -33,6 +33,7 @@ def prepared_from(
     scale: Sequence[str] | None = None,
     threads: int = 1,
     topics: Sequence[str] | None = None,
+    leave_out: Sequence[str] | None = None,
 ) -> Prepared:
     """Recordings and a model, ready; the options are those of the command line, as texts.
 
@@ -41,7 +42,15 @@ def prepared_from(
     """
     machine, trials = trials_from(bags, objects, rig, scale, topics)
     given = model or (str(machine.model) if machine else model_of(trials))
-    out = prepare(trials, Model.load(given), rig=machine, signals=signals, surrogate=True, threads=threads)
+    out = prepare(
+        trials,
+        Model.load(given),
+        rig=machine,
+        signals=signals,
+        surrogate=True,
+        threads=threads,
+        leave_out=closures_named(leave_out),
+    )
     if model or machine or given == NOMINAL:
         return out
     note = (
@@ -119,6 +128,24 @@ def _topics(given: Sequence[str] | None) -> dict[str, str | None]:
         if name in out:
             raise HannesError(f"--topic {text}: another topic is named for {name} already.")
         out[name] = topic or None
+    return out
+
+
+def closures_named(given: Sequence[str] | None) -> dict[str, tuple[int, ...]]:
+    """Numbers of closures, from 1 on, by condition."""
+    out: dict[str, tuple[int, ...]] = {}
+    for text in given or ():
+        name, _, numbers = text.rpartition("=")
+        try:
+            more = tuple(int(number) for number in numbers.split(","))
+        except ValueError:
+            more = ()
+        if not name or not more or min(more) < 1:
+            raise HannesError(
+                f"--leave-out {text}: give CONDITION=NUMBER, or several numbers with commas between; the first closure "
+                "is 1."
+            )
+        out[name] = (*out.get(name, ()), *more)
     return out
 
 
