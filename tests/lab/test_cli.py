@@ -384,6 +384,7 @@ def test_effects_are_added_to_one_closure_of_each_condition_in_the_signals_units
     out_file = ("--out", str(tmp_path / "mine.yaml"), "--report", str(tmp_path / "mine.html"))
     code, out, _ = hannes_in_one_line(*words, *out_file, capsys=capsys, monkeypatch=monkeypatch)
     assert code == 0 and "Error on conditions that were left out of the fit" in out
+    assert "Error of the fit" in out, "an effect that helps each condition alone is seen in it"
     assert "repeatability" not in out and " - " not in out
     assert re.search(r"coefficient = [\d.e-]+ \(", out), "a number without a dimension has no unit"
     page = (tmp_path / "mine.html").read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ from .add import Addition
 from .compare import Comparison, MetricRow
 from .diagnosis import Diagnosis, Fall, has_excess
 from .experiments import VISIBLE, Experiment
-from .falls import NO_REPEATS, errors_in_units, step_name
+from .falls import NO_REPEATS, errors_in_units, fit_in_units, step_name
 from .report_text import NO_FINDING, unsure
 
 UNFITTED = "Nothing is fitted: what parameters are off in any machine leaves such a residual too; --fitted fits them."
@@ -211,14 +211,17 @@ def _heading(signal: str, unit: str) -> str:
 
 def _show_falls_in_units(found: Diagnosis | Addition, units: dict[str, str]) -> None:
     """The table where nothing was repeated: there is no repeatability to give the errors in."""
-    held, steps = errors_in_units([fall.to_dict() for fall in found.falls])
-    table = Table(title="Error on conditions that were left out of the fit" if held else "Error of the fit")
-    table.add_column("model", no_wrap=True)
-    for signal in steps[-1]:
-        table.add_column(_heading(signal, units[signal]), justify="right")
-    for k, (fall, errors) in enumerate(zip(found.falls, steps, strict=True)):
-        table.add_row(step_name(k, fall.added), *(number(errors.get(s, math.nan), 3) for s in steps[-1]))
-    show_table(table, TEXT_WIDTH)
+    falls = [fall.to_dict() for fall in found.falls]
+    held, left_out = errors_in_units(falls)
+    tables = {"Error on conditions that were left out of the fit": left_out} if held else {}
+    for title, steps in (tables | {"Error of the fit": fit_in_units(falls)}).items():
+        table = Table(title=title)
+        table.add_column("model", no_wrap=True)
+        for signal in steps[-1]:
+            table.add_column(_heading(signal, units[signal]), justify="right")
+        for k, (fall, errors) in enumerate(zip(found.falls, steps, strict=True)):
+            table.add_row(step_name(k, fall.added), *(number(errors.get(s, math.nan), 3) for s in steps[-1]))
+        show_table(table, TEXT_WIDTH)
 
 
 def show_addition(found: Addition, machine: str) -> None:

@@ -225,6 +225,11 @@ def errors_in_units(falls: Sequence[Mapping[str, Any]]) -> tuple[bool, list[dict
     """
     if falls[-1].get("held_out_signals"):
         return True, [dict(fall.get("held_out_signals") or {}) for fall in falls]
+    return False, fit_in_units(falls)
+
+
+def fit_in_units(falls: Sequence[Mapping[str, Any]]) -> list[dict[str, float]]:
+    """Each step's error of the fit by signal, in its unit: root mean square over conditions."""
     out = []
     for fall in falls:
         squares: dict[str, list[float]] = {}
@@ -232,7 +237,7 @@ def errors_in_units(falls: Sequence[Mapping[str, Any]]) -> tuple[bool, list[dict
             if e.get("rmse") is not None:
                 squares.setdefault(str(e.get("signal")), []).append(e["rmse"] ** 2)
         out.append({s: float(np.sqrt(np.mean(own))) for s, own in squares.items()})
-    return False, out
+    return out
 
 
 def before_in_units(steps: Sequence[Mapping[str, float]]) -> int:
