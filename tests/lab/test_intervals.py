@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -13,13 +14,14 @@ from hannes_lab.chance import Chance
 from hannes_lab.diagnose import effect_sources
 from hannes_lab.fit import Fit
 from hannes_lab.hide import make_set
-from hannes_lab.intervals import intervals_of, may_vanish, strain, sway, wider
+from hannes_lab.intervals import NORMAL, intervals_of, may_vanish, strain, sway, wider
 from hannes_lab.prepare import prepare
 from hannes_lab.problem import Coordinate
 from hannes_lab.search import FAR, Search
+from hannes_lab.secants import grain_of
 from hannes_lab.trials import make_trial
 from hannes_lab.twins import imitation, twins
-from hannes_lab.wording import far_off
+from hannes_lab.wording import far_off, jumps
 from hannes_sim.effect import EffectParameter, load_effect
 
 SIZE, CONDITIONS = 60, ("slow", "fast", "grasp")
@@ -227,3 +229,39 @@ def paired_fit(trials: int, scatter: float, seed: int) -> tuple[Any, Fit]:
     z = np.array([along @ measured / (along @ along)])
     residual = measured - z[0] * along
     return problem, Fit(nominal(), (SLOPE,), z, float(residual @ residual), residual, -along[:, None])
+
+
+def jumpy(by: float, bend: float = 0.0) -> tuple[Any, Fit]:
+    """A misfit of 100 + z^2 (and a bend) for a slope, and jumps of a standard deviation `by` from place to place."""
+
+    def residual(model: Model, values: Any) -> Any:
+        z = values["slope"]
+        place = np.random.default_rng(round(abs(z) * 1e6) + (z < 0.0))
+        return np.array([np.sqrt(100.0 + by * place.standard_normal() + bend * z**3), z])
+
+    problem: Any = SimpleNamespace(residual=residual, failures=0)
+    return problem, Fit(
+        nominal(), (SLOPE,), np.zeros(1), 100.0, np.array([10.0, 0.0]), np.array([[0.0], [1.0]])
+    )
+
+
+def test_a_misfit_that_jumps_is_told_from_one_that_bends() -> None:
+    assert grain_of(*jumpy(0.0)) < 1e-9 and grain_of(*jumpy(0.0, bend=0.5)) < 1e-9
+    found = grain_of(*jumpy(3.0))
+    assert 0.5 < found < 9.0 and grain_of(*jumpy(30.0)) == pytest.approx(10.0 * found, rel=0.02)
+    nowhere = Fit(nominal(), (), np.zeros(0), 0.0, np.zeros(1), np.zeros((1, 0)))
+    assert grain_of(jumpy(3.0)[0], nowhere) == 0.0
+
+
+def test_where_the_misfit_jumps_intervals_are_wider_and_it_is_said() -> None:
+    _, found = jumpy(0.0)
+    chance: Any = SimpleNamespace(median=100.0, misfit=130.0, gain=0.0)
+    low, high = intervals_of(found, chance)["slope"]
+    rough = replace(found, grain=1.5 * NORMAL**2)
+    assert intervals_of(rough, chance)["slope"] == pytest.approx((2.0 * low, 2.0 * high))
+    assert intervals_of(rough, chance, {"slope": 3.0})["slope"] == pytest.approx((3.0 * low, 3.0 * high))
+    assert not jumps(found, chance)
+    (said,) = jumps(rough, chance)
+    assert said.startswith("the misfit jumps by some 5.8 ") and "are 2.0 times as wide" in said
+    noisy: Any = SimpleNamespace(median=1.0, misfit=1.3, gain=0.0)
+    assert not jumps(rough, noisy), "against what else is left it is little"

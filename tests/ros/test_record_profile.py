@@ -15,7 +15,7 @@ import pytest
 from graph import NodeProcess, Peer, processes
 from hannes_bags.reading import read_bag
 from hannes_bringup import graph_watch
-from hannes_bringup.graph_watch import follow_profile, followers_of_the_reference, require_free_hand
+from hannes_bringup.graph_watch import follow_profile, is_recorded, require_free_hand
 from hannes_control.reference import make_profile
 from hannes_description.errors import HannesError
 from hannes_ros import convert
@@ -72,6 +72,43 @@ def test_a_profile_is_recorded_to_its_end(
     assert np.isin(reference.values, played).all() and reference.time[-1] - reference.time[0] > 2.0
 
 
+def test_profiles_of_a_hand_in_lockstep_are_recorded_whole_one_after_the_other(
+    tmp_path: Path, ros_environment: dict[str, str]
+) -> None:
+    """Its time goes as fast as it is answered, and stands between two recordings: each begins with its profile."""
+    played = make_profile("half_sine", closures=2, period=1.5)
+    curves = []
+    with processes(NodeProcess("hand_sim", clock="lockstep", object="soft", command_timeout_ms=1000.0)):
+        for name in ("first", "second"):
+            words = (
+                "record",
+                str(tmp_path / name),
+                "--profile",
+                "half_sine",
+                "--closures",
+                "2",
+                "--period",
+                "1.5",
+            )
+            told = subprocess.run(
+                [sys.executable, "-m", "hannes_bringup.cli", *words],
+                env=ros_environment, capture_output=True, text=True, timeout=PATIENCE,
+            )  # fmt: skip
+            assert told.returncode == 0, told.stderr
+            read = read_bag(tmp_path / name)
+            assert read.metadata["plant"] == "reduced" and read.metadata["object"] == "soft"
+            reference = read["reference_position"]
+            np.testing.assert_array_equal(reference.values[: played.size], played)
+            assert not reference.values[played.size :].any() and reference.values.size > played.size + 1000
+            encoder = read["encoder_position"]
+            assert np.ptp(np.diff(np.unique(encoder.time))) < 1e-6, "a tick is missing"
+            curves.append(np.interp(reference.time[0] + 1e-3 * np.arange(3000), encoder.time, encoder.values))
+    np.testing.assert_allclose(
+        curves[1], curves[0], atol=0.06
+    )  # the first one began where nothing was wound up
+    assert curves[0].max() > 5.0
+
+
 def test_what_the_controller_reported_of_a_run_is_told_where_it_was_no_good() -> None:
     assert graph_watch._told_of_a_run(["ok: running", "warn: running; missed 12 of 1000 cycles"]) == ""
     told = graph_watch._told_of_a_run(
@@ -81,10 +118,10 @@ def test_what_the_controller_reported_of_a_run_is_told_where_it_was_no_good() ->
 
 
 def test_who_hears_the_reference_of_a_profile() -> None:
-    assert followers_of_the_reference(None) == 2
-    assert followers_of_the_reference(["motor/state", "reference_position"]) == 2
-    assert followers_of_the_reference([graph_watch.REFERENCE]) == 2
-    assert followers_of_the_reference(["motor/state"]) == 1
+    assert is_recorded(graph_watch.REFERENCE, None)
+    assert is_recorded(graph_watch.REFERENCE, ["motor/state", "reference_position"])
+    assert is_recorded(graph_watch.REFERENCE, [graph_watch.REFERENCE])
+    assert not is_recorded(graph_watch.REFERENCE, ["motor/state"])
 
 
 def test_a_profile_is_refused_where_it_would_mix_with_another_reference(peer: Peer) -> None:

@@ -39,7 +39,7 @@ _ELSEWHERE_S = 10.0
 _OWN_CLOCK_NS = 1_000_000_000
 _HELD_MS = 170.0
 """From when a message is taken until it is handed over at the latest: less than the 0.2 s that a kill may take."""
-_DEPTH = 4000
+_DEPTH = 10_000
 _MOST_AT_ONCE = 5000
 _LEADING = SIGNALS["encoder_position"].topic
 _DRIVING = SIGNALS["motor_voltage"].topic

@@ -15,13 +15,14 @@ from hannes_description.signals import SIGNALS
 from hannes_ros.node import DEFAULT_NAMESPACE
 from hannes_ros.reach import not_beyond
 from hannes_ros.taking import taken
-from hannes_ros.topics import DIAGNOSTICS_TOPIC
+from hannes_ros.topics import CLOCK_TOPIC, DIAGNOSTICS_TOPIC
 from rclpy.context import Context
 from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from .visitor import visit
@@ -30,6 +31,7 @@ QUIET, LONGEST = 0.5, 3.0
 """s: discovery is over when no topic or node was added for QUIET, or after LONGEST."""
 HAND = f"/{DEFAULT_NAMESPACE}/{SIGNALS['encoder_position'].topic}"
 REFERENCE = f"/{DEFAULT_NAMESPACE}/{SIGNALS['reference_position'].topic}"
+VOLTAGE = f"/{DEFAULT_NAMESPACE}/{SIGNALS['motor_voltage'].topic}"
 BEGINS, STANDS, REST = 30.0, 5.0, 1.5
 """s: a profile begins within BEGINS, stands for no longer than STANDS, and is followed for REST more."""
 HIDDEN = ("/parameter_events", "/rosout")
@@ -95,9 +97,12 @@ def watch(window: float, context: Context | None = None) -> GraphSeen:
         return _watch(node, executor, window)
 
 
-def require_free_hand(timeout: float) -> None:
-    """Raise a HannesError where no hand is found within `timeout` seconds (nobody who publishes motor/state), or where
-    somebody moves it already."""
+def require_free_hand(timeout: float) -> bool:
+    """Whether the hand that runs is in lock-step: it takes voltages, and tells the time.
+
+    Raises a HannesError where no hand is found within `timeout` seconds (nobody who publishes motor/state), or where
+    somebody moves it already.
+    """
     with visit("peers", EventsExecutor) as (node, executor):
         end = time.monotonic() + timeout
         while not node.count_publishers(HAND):
@@ -112,6 +117,9 @@ def require_free_hand(timeout: float) -> None:
             raise HannesError(
                 f"{REFERENCE} is published already, by {', '.join(others)}: a profile would mix with it. End that node."
             )
+        told, taken_in = node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic
+        ends = (told(HAND), told(CLOCK_TOPIC), taken_in(VOLTAGE))
+        return bool(set.intersection(*({(i.node_namespace, i.node_name) for i in end} for end in ends)))
 
 
 def wait_for_recorder(running: Callable[[], bool]) -> None:
@@ -125,23 +133,24 @@ def wait_for_recorder(running: Callable[[], bool]) -> None:
             _spin(executor, 0.05)
 
 
-def followers_of_the_reference(recorded: list[str] | None) -> int:
-    """How many hear the reference of a profile from its begin on: `follow_profile`, and the recorder if the reference
-    is among the topics that it records; None: all of the hand's."""
-    names = [REFERENCE] if recorded is None else recorded
-    return 1 + any(name in (REFERENCE, REFERENCE.removeprefix(f"/{DEFAULT_NAMESPACE}/")) for name in names)
+def is_recorded(topic: str, recorded: list[str] | None) -> bool:
+    """Whether a topic of the hand is among those that a recorder records; None: all of the hand's."""
+    return recorded is None or any(
+        name in (topic, topic.removeprefix(f"/{DEFAULT_NAMESPACE}/")) for name in recorded
+    )
 
 
-def follow_profile(seconds: float, running: Callable[[], bool]) -> str:
+def follow_profile(seconds: float, running: Callable[[], bool], *, lockstep: bool = False) -> str:
     """Return when the controller has played its profile of so many seconds and the hand has come to rest, or when
     `running` is no longer true: a sentence on what it reported of itself meanwhile, empty where all was well.
 
     Looks ten times a second whether references have come, instead of at each message: the control loop beside it needs
-    the machine. So the time that was played is an estimate, which REST covers.
+    the machine. So the time that was played is an estimate, which REST covers; in lock-step it is the hand's (/clock).
     Raises HannesError where the profile does not begin, or stands: with what the controller says of itself.
     """
     with visit("profile", EventsExecutor) as (node, _):
         reference = node.create_subscription(Float64, REFERENCE, _never_called, _listener_qos(1), raw=True)
+        clock = _SimulatedTime(node) if lockstep else None
         said = node.create_subscription(
             DiagnosticArray, DIAGNOSTICS_TOPIC, _never_called, _listener_qos(), raw=True
         )
@@ -151,8 +160,9 @@ def follow_profile(seconds: float, running: Callable[[], bool]) -> str:
         while running():
             time.sleep(0.1)
             now = time.monotonic()
+            went_on = clock.elapsed() if clock else now - before
             if list(taken(reference)):
-                played, last = played + now - before, now
+                played, last = played + went_on, now
             before = now
             told = _health([message for message, _ in taken(said)]).items()
             new = [what for who, what in told if who.endswith("motor_controller")]
@@ -170,6 +180,30 @@ def follow_profile(seconds: float, running: Callable[[], bool]) -> str:
                     f'The profile {what}; the controller says "{health}". What came is in the bag; record again.'
                 )
     return ""
+
+
+class _SimulatedTime:
+    """How much later it is by /clock at each look."""
+
+    def __init__(self, node: Node) -> None:
+        self._clock = node.create_subscription(Clock, CLOCK_TOPIC, _never_called, _listener_qos(), raw=True)
+        self._last: float | None = None
+
+    def elapsed(self) -> float:
+        """s since the look before, or at the first look since the first time that came."""
+        said = [message for message, _ in taken(self._clock)]
+        if not said:
+            return 0.0
+        first, last = (_seconds(said[k]) for k in (0, -1))
+        elapsed = last - (first if self._last is None else self._last)
+        self._last = last
+        return elapsed
+
+
+def _seconds(message: bytes) -> float:
+    """The time of a /clock, s."""
+    stamp = deserialize_message(message, Clock).clock
+    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
 def _told_of_a_run(reports: Sequence[str]) -> str:

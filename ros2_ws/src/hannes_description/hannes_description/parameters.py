@@ -100,8 +100,10 @@ class Parameter:
     def from_dict(cls, name: str, entry: object, where: str) -> Parameter:
         """Read one entry of a YAML file; errors name the parameter and the file."""
         if not isinstance(entry, Mapping):
+            value = entry if isinstance(entry, Real) and not isinstance(entry, bool) else 1.0
             raise HannesError(
-                f"{where}: parameter '{name}' must be a mapping with the keys {', '.join(_KEYS)}."
+                f"{where}: parameter '{name}' must be a mapping with the keys {', '.join(_KEYS)}, such as "
+                f"{{value: {value}, unit: the unit, status: assumed, source: where it is from}} for an override."
             )
         unknown = sorted(set(entry) - set(_KEYS), key=str)
         missing = [key for key in _KEYS[:6] if key not in entry]

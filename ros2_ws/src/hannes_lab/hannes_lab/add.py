@@ -21,6 +21,7 @@ from .features import data_used
 from .prepare import Prepared
 from .screen import silent_effects
 from .search import Progress, Search, silent
+from .wording import jumps
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def add_effects(
         found_effects(search, best, intervals, falls),
         falls,
         data_used(prepared.features),
-        (*silent, *prepared.notes),
+        (*silent, *prepared.notes, *jumps(best.fit, limits)),
         best.fit.values,
         null.fit.values,
         None if prepared is given else prepared,

@@ -309,6 +309,7 @@ class Codec:
                 raise NotPlain("a fit of another model")
             own = {"z": result.z, "cost": float(result.cost)}
             own |= {"residual": result.residual, "jacobian": result.jacobian, "complete": result.complete}
+            own["grain"] = float(result.grain)
             return {"kind": "Fit", "names": list(names), **own}
         if type(result).__name__ in self._kinds:
             own = {f.name: self.pack(getattr(result, f.name)) for f in fields(result)}
@@ -324,7 +325,7 @@ class Codec:
         kind = content["kind"]
         if kind == "Fit":
             model, coordinates = self._rebuild(tuple(content["names"]))
-            numbers = (content[name] for name in ("z", "cost", "residual", "jacobian", "complete"))
+            numbers = (content[name] for name in ("z", "cost", "residual", "jacobian", "complete", "grain"))
             return Fit(model, tuple(coordinates), *numbers)
         if kind == "tuple":
             return tuple(self.unpack(one) for one in content["items"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,10 +13,13 @@ from .choose import Choice
 from .diagnosis import Fall, FoundEffect
 from .falls import fall_sentence
 from .prepare import FEW
-from .report_text import UNKNOWN, listed
+from .report_text import UNKNOWN, listed, words
 from .search import Candidate, Search
 from .twins import twins
 from .wording import NAMED, Clock, explains_most, far_off, far_values, nearest_sentence, unforetold
+
+MUCH = 2.0
+"""Error of a signal in a condition, in multiples of the repeatability, from which "nothing" says where it is."""
 
 CLOCK_LEADS = 0.5
 """Part from which it is said in the summary: what is left after that may need no effect."""
@@ -104,8 +108,21 @@ class Conclusion:
         nearest = "" if choice.idle or self.greedy else nearest_sentence(choice)
         far = self._far
         return (
-            f"Nothing is missing: with its own parameters fitted, {explained}{other}. {self._fall}"
+            f"Nothing is missing: with its own parameters fitted, {explained}{other}. {self._fall}{self._largest}"
             f"{far and far + nearest}"
+        )
+
+    @property
+    def _largest(self) -> str:
+        """Where a model that has an error of its own misses most, and what that hides; empty where it is little."""
+        known = [e for e in self.falls[-1].signals if math.isfinite(e.ratio)]
+        worst = max(known, key=lambda e: e.ratio, default=None)
+        if worst is None or worst.ratio < MUCH or not self.search.problem.discrepancy:
+            return ""
+        return (
+            f" It is largest in {words(worst.signal)} of '{worst.condition}', {worst.ratio:.1f} times the "
+            "repeatability: of another machine the form of the model may be off by as much, and what leaves less is "
+            "not seen."
         )
 
     def _effects(self) -> str:

@@ -35,6 +35,8 @@ class Fit:
     residual    (size,) whitened residual of all features, also of those that were held out
     jacobian    (size, k) derivative of the residual by z
     complete    False where the search ended early since nothing of worth was in reach
+    grain       standard deviation of what the misfit jumps by from place to place beside the point (grain_of); 0 where
+                nobody looked
     """
 
     model: Model
@@ -44,6 +46,7 @@ class Fit:
     residual: Array
     jacobian: Array
     complete: bool = True
+    grain: float = 0.0
 
     @property
     def values(self) -> dict[str, float]:

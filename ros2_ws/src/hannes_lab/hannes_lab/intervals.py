@@ -140,14 +140,24 @@ def intervals_of(
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals by name, from the curvature of the cost, inside the parameter's bounds.
 
-    Wider by as much as the misfit is larger than chance makes it, and by `wider` times (strain, sway).
+    Wider by as much as the misfit is larger than chance makes it, and by `wider` times (strain, sway), or by what the
+    misfit's jumps say if that is more.
     """
-    out = {}
+    out, rough = {}, grain_widens(found, limits)
     for c, z, s in zip(found.coordinates, found.z, found.sd(_inflation(found, limits)), strict=True):
-        half = NORMAL * float(s) * (wider or {}).get(c.name, 1.0)
+        half = NORMAL * float(s) * max((wider or {}).get(c.name, 1.0), rough)
         ends = sorted((c.value(float(z) - half), c.value(float(z) + half)))
         out[c.name] = (ends[0], ends[1])
     return out
+
+
+def grain_widens(found: Fit, limits: Chance) -> float:
+    """How many times wider all intervals are for the misfit's jumps (Fit.grain).
+
+    A fit may end wherever the parabola beneath them has risen by two of their standard deviations beyond the NORMAL^2
+    that end an interval.
+    """
+    return float(np.sqrt(1.0 + 2.0 * found.grain / (NORMAL**2 * _inflation(found, limits))))
 
 
 def _inflation(found: Fit, limits: Chance) -> float:

@@ -31,7 +31,7 @@ from .problem import (
 )
 from .rig import Nuisance
 from .scan import Scan, Scored, farthest, point_key, shapes_of, tried_periods
-from .secants import over_its_spread
+from .secants import grain_of, over_its_spread
 from .settle import MOVES, at_anchor, least_gain, seen_from, settle, slopes_at
 from .surrogate import AnchoredRig, anchored_at
 
@@ -460,7 +460,8 @@ class Search:
 
     def _with_spread(self, candidate: Candidate) -> Candidate:
         problem = self.problem.with_rig(slopes_at(self.problem.rig, candidate.fit))
-        return replace(candidate, fit=over_its_spread(problem, candidate.fit))
+        found = over_its_spread(problem, candidate.fit)
+        return replace(candidate, fit=found if self.slow else replace(found, grain=grain_of(problem, found)))
 
     def renewed(self, best: Candidate) -> Search:
         """The same search with noise and scatter estimated at another point: sensitivities there are the true ones."""

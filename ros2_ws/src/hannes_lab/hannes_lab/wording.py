@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from hannes_description.output import number
 
 from .adequacy import disbelieved, unshown, waves_of
+from .chance import Chance
 from .choose import Choice, can_be_held_out, halved, needed_gain
 from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect, Rank
@@ -17,6 +19,7 @@ from .directions import ways
 from .experiments import VISIBLE, Experiment
 from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, deciding_errors, left_out_errors
 from .fit import Fit, fit
+from .intervals import grain_widens
 from .problem import Coordinate, Problem, nuisance_coordinate
 from .rig import Nuisance
 from .scan import period_of
@@ -164,6 +167,22 @@ def notes(
         *_identifiability(best),
         *failure_notes(search.problem),
     )
+
+
+JUMPS = 2.0
+"""How many times wider intervals are for the misfit's jumps from which it is said that it jumps."""
+
+
+def jumps(found: Fit, limits: Chance) -> list[str]:
+    """That the misfit jumps where parameters change little, and what follows of it."""
+    times = grain_widens(found, limits)
+    if times < JUMPS:
+        return []
+    return [
+        f"the misfit jumps by some {number(found.grain, 2)} where parameters change by a part of their intervals, as "
+        "a control law that computes in whole numbers makes it: fits from other starts may end elsewhere, and "
+        f"intervals are {times:.1f} times as wide as they would be without that, or more"
+    ]
 
 
 def unmoved(found: Fit) -> list[str]:

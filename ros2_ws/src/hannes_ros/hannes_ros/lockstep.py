@@ -22,10 +22,20 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+
 _GIGA = 1_000_000_000
 
 SETTLE_S = 0.05
 """s of wall time without a message after which all repetitions of a tick have arrived."""
+
+
+TOGETHER = 250
+"""Ticks after which hand_sim looks whether all who listen have what it sent."""
+
+UNHEARD_S = 0.1
+"""s of wall time that it waits for that: a listener that was killed stays matched for a while."""
 
 
 def stamp_of_tick(tick: int, period_ns: int) -> int:
@@ -36,6 +46,30 @@ def stamp_of_tick(tick: int, period_ns: int) -> int:
 def samples_until(stamp_ns: int, rate: int) -> int:
     """How many samples of a signal at `rate` Hz (integer), sampled at j / rate from 0 on, have a time <= the stamp."""
     return stamp_ns * rate // _GIGA + 1
+
+
+class Pace:
+    """Keeps lock-step from outrunning who listens without answering, such as a recorder.
+
+    Each node answers each tick, so those of the loop cannot fall behind; but a publisher keeps a limited number of
+    messages, and what a slow listener has not got by then is lost.  So all wait until it has caught up, which it says
+    at the next heartbeat of the middleware (0.02 s with this project's profile).
+
+    outputs  the first one is that which all of the loop hear
+    """
+
+    def __init__(self, *outputs: Publisher) -> None:
+        self._outputs = outputs
+
+    def after(self, tick: int) -> None:
+        """Called after each tick was published.
+
+        Each TOGETHER ticks it returns when all listeners have got what was sent, or after UNHEARD_S for each output.
+        A controller alone needs no such wait.
+        """
+        if tick % TOGETHER == 0 and self._outputs[0].get_subscription_count() > 1:
+            for output in self._outputs:
+                output.wait_for_all_acked(Duration(seconds=UNHEARD_S))
 
 
 class Probe:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 USAGE_ERROR = 2
 # A signal is noticed when spin_once returns.
 _SPIN_S = 0.1
-# A message that was dropped on the way is sent again after a heartbeat: 0.1 s later with the project's profile of Fast
+# A message that was dropped on the way is sent again after a heartbeat: 0.02 s later with the project's profile of Fast
 # DDS, 3 s with its own.
 _DELIVER_S = 4.0
 # Destroying a node takes milliseconds, but Fast DDS 2.14 may wait in it for ever for a thread of its own that has just

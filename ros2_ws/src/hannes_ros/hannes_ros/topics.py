@@ -2,7 +2,8 @@
 
 Names, types and units come from `hannes_description.signals`; only the QoS is decided here. Every topic is reliable and
 volatile: in lock-step a lost message would stop the loop, and a recorder must not miss a tick. The depth of a signal
-that comes at each tick covers about a second of stall of a subscriber at 1 kHz.
+that comes at each tick covers about a second of stall of a subscriber at 1 kHz; what is sent is kept longer, for in
+lock-step a second has many more ticks.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ MESSAGE_TYPES: Final[Mapping[str, type]] = MappingProxyType(
 
 _EACH_TICK: Final = frozenset({"reference_position", "motor/state", "motor/current", "motor/voltage"})
 _TICK_DEPTH: Final = 1000
+_SENT_DEPTH: Final = 5000
 _SLOW_DEPTH: Final = 300
 
 
@@ -68,16 +70,18 @@ def message_type(name: str) -> type:
     return MESSAGE_TYPES[signal(name).type]
 
 
-def qos(name: str) -> QoSProfile:
-    """QoS of the topic that carries the signal (the same for publishers and subscriptions)."""
-    return _reliable(_TICK_DEPTH if signal(name).topic in _EACH_TICK else _SLOW_DEPTH)
+def qos(name: str, each_tick: int = _TICK_DEPTH) -> QoSProfile:
+    """QoS of the topic that carries the signal, with the depth of those that come at each tick."""
+    return _reliable(each_tick if signal(name).topic in _EACH_TICK else _SLOW_DEPTH)
 
 
 def publisher(node: Node, name: str, on_match: Callable[[Any], None] | None = None) -> Publisher:
     """Publisher of the signal's topic, relative to the node's namespace; `on_match` is told of new and
     lost subscribers."""
     events = PublisherEventCallbacks(matched=on_match) if on_match else None
-    return node.create_publisher(message_type(name), signal(name).topic, qos(name), event_callbacks=events)
+    return node.create_publisher(
+        message_type(name), signal(name).topic, qos(name, _SENT_DEPTH), event_callbacks=events
+    )
 
 
 def subscription(
@@ -93,7 +97,7 @@ def subscription(
 def clock_publisher(node: Node, on_match: Callable[[Any], None] | None = None) -> Publisher:
     """Publisher of simulated time; `on_match` is told of new and lost subscribers."""
     events = PublisherEventCallbacks(matched=on_match) if on_match else None
-    return node.create_publisher(Clock, CLOCK_TOPIC, CLOCK_QOS, event_callbacks=events)
+    return node.create_publisher(Clock, CLOCK_TOPIC, _reliable(_SENT_DEPTH), event_callbacks=events)
 
 
 def clock_subscription(node: Node, callback: Callable[[bytes], None]) -> Subscription:

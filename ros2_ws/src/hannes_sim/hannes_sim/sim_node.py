@@ -14,7 +14,7 @@ from hannes_description.model import Model
 from hannes_ros import convert, topics
 from hannes_ros.command import CommandGate
 from hannes_ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
-from hannes_ros.lockstep import Peers, Probe, StallWatch, stamp_of_tick
+from hannes_ros.lockstep import Pace, Peers, Probe, StallWatch, stamp_of_tick
 from hannes_ros.loop import RealtimeLoop
 from hannes_ros.node import CLOCK_HELP, CLOCKS, DEFAULT_NAMESPACE, HannesNode
 from hannes_ros.node_parameters import declare, parameter
@@ -144,6 +144,8 @@ class HandSim(HannesNode, Node):
         self._current = topics.publisher(self, "motor_current", self._on_match)
         self._joints = topics.publisher(self, "joint_positions")
         self._force = topics.publisher(self, "grip_force")
+        if self._lockstep:
+            self._pace = Pace(self._state, self._current, self._sim_clock)
         self._last: tuple[bytes, bytes] = (b"", b"")
         on_voltage = self._on_tick_voltage if self._lockstep else self._on_voltage
         self._sources = Sources(self, "motor_voltage", rule="only one may drive the motor")
@@ -289,6 +291,7 @@ class HandSim(HannesNode, Node):
         self._waiting = True
         self._watch.published(monotonic())
         self._publish(stamp_ns)
+        self._pace.after(self._tick)
 
     def _on_tick_voltage(self, data: bytes) -> None:
         if not self._waiting:

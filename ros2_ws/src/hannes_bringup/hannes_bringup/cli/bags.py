@@ -51,8 +51,8 @@ def record(
 ) -> None:
     """Record the topics of the hand into a bag (MCAP, safe against a crash); Ctrl-C ends it.
 
-    With --profile a motor_controller is started too, which closes the hand that is running (hand_sim, or the real one)
-    along a reference profile; the recording ends with the profile.
+    With --profile a motor_controller is started too, which closes the hand that is running (hand_sim, in real time or
+    in lock-step, or the real one) along a reference profile; the recording ends with the profile.
     """
     import json
 
@@ -75,7 +75,7 @@ def record(
         _become("recorder", parameters, more or [], namespace)
 
 
-SEEK = 5.0
+SEEK = 10.0
 """s in which a hand that runs is found."""
 
 
@@ -113,15 +113,20 @@ def _record_profile(
     require_ros()
     apply_ros_environment()
     from hannes_bringup.graph_watch import (
+        REFERENCE,
+        VOLTAGE,
         follow_profile,
-        followers_of_the_reference,
+        is_recorded,
         require_free_hand,
         wait_for_recorder,
     )
 
-    told = any(word.startswith("topics:=") for word in more)
-    controller["reference_subscribers"] = followers_of_the_reference([] if told else recorder.get("topics"))
-    require_free_hand(SEEK)
+    recorded = [] if any(word.startswith("topics:=") for word in more) else recorder.get("topics")
+    # `follow_profile` hears the reference from its begin on too, and the hand the voltage
+    controller["reference_subscribers"] = 1 + is_recorded(REFERENCE, recorded)
+    lockstep = require_free_hand(SEEK)
+    if lockstep:
+        controller |= {"clock": "lockstep", "subscribers": 1 + is_recorded(VOLTAGE, recorded)}
     environment = ros_environment()
     raise_on_signals()
     with ProcessGroup(lambda text: typer.echo(text, err=True), environment) as group:
@@ -131,7 +136,7 @@ def _record_profile(
             wait_for_recorder(lambda: bool(group.running))
             driving = find_command(NODES["motor_controller"], "motor_controller", environment)
             group.start("motor_controller", [*driving, *_words(controller, [])])
-            disturbed = follow_profile(seconds, lambda: len(group.running) == 2)
+            disturbed = follow_profile(seconds, lambda: len(group.running) == 2, lockstep=lockstep)
             if len(group.running) < 2:
                 raise typer.Exit(1)
             if disturbed:

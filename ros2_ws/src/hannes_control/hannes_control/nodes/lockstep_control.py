@@ -47,12 +47,13 @@ class LockstepControl:
         self._probe = Probe(sources.mixed)
         self.heard = self._probe.on_match
         self._answered = self._came = -1
+        self._began: int | None = None
         self._reported = 0
         self.last_input = 0.0
 
     def on(self) -> None:
-        """Motor on."""
-        self.active = True
+        """Motor on; a profile of its own begins with the tick that is answered first."""
+        self.active, self._began = True, None
         if self._join.synchronised:
             self._answer()
 
@@ -75,6 +76,7 @@ class LockstepControl:
         if sample.stamp_ns < self._answered:  # the simulator began again
             self._join.reset()
             self._answered = self._came = -1
+            self._began = None
             self._drive.inputs.reference = None
             self._drive.clear()
         elif sample.stamp_ns == self._came:  # repeated to a newcomer
@@ -132,7 +134,10 @@ class LockstepControl:
                 )
                 return
             drive = self._drive
-            own = None if drive.follows_topic else drive.profile_at(sample.stamp_ns // self._period_ns)
+            if self._began is None:
+                self._began = sample.stamp_ns
+            since = (sample.stamp_ns - self._began) // self._period_ns
+            own = None if drive.follows_topic else drive.profile_at(since)
             self._answered = sample.stamp_ns
             if not self._join.synchronised:
                 self._join.synchronise()

@@ -117,7 +117,10 @@ class RealtimeControl:
         else:
             clock = "the clock of this machine (for a played bag set use_sim_time)"
         if not stamp_ns:
-            return f"its header has no stamp; set it by {clock}"
+            return (
+                f"its header has no stamp; set it by {clock}. A hand_sim in lock-step counts from 0: give the "
+                "controller clock:=lockstep too"
+            )
         side = "before" if age > 0.0 else "after"
         return f"it is stamped {abs(age):.3g} s {side} {clock}; {self._timeout:g} s are allowed"
 
