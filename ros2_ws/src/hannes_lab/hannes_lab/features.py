@@ -40,6 +40,9 @@ FINEST = 1e-5
 repeats itself bit for bit; they are taken to be known by the second, as by a sensor of 17 bits, or as another machine's
 rig says (`finest`)."""
 
+NOISELESS = 0.1
+"""Scatter between closures, as a part of what stands for it then (Block.coarse), up to which it is no noise."""
+
 NEARLY = 0.02
 """Mean difference of the references of two closures, in their span, up to which one repeats the other but for a
 difference that hardly depends on the model."""
@@ -68,6 +71,8 @@ class Block:
     compact    the same three for a simulation of the closures only that others repeat; None where that does not hold
     beside     (n, p) what closures differ by from those of a compact simulation, where they repeat each other nearly
     finest     of the signal's span: scatter that is assumed where closures are all the same
+    coarse     of the signal's span: scatter that is assumed where closures scatter by next to nothing against it; 0:
+               they are taken as they are
     """
 
     trial: int
@@ -79,6 +84,7 @@ class Block:
     compact: tuple[Index, Index, Array] | None
     unit: str = ""
     finest: float = FINEST
+    coarse: float = 0.0
     beside: Array | None = None
 
     @property
@@ -92,14 +98,28 @@ class Block:
 
     @property
     def floor(self) -> float:
-        """Scatter that is assumed of closures that are all the same, in the signal's unit; 0 of others."""
+        """Scatter that is assumed of closures that are, or nearly are, all the same, in the signal's unit; 0 of
+        others."""
         return self.floor_in(slice(None))
 
     def floor_in(self, phases: slice | NDArray[np.bool_]) -> float:
         """The same of a part of the phases: a coarse sensor shows the same again and again while nothing moves."""
         span = float(np.ptp(self.measured))
         same = self.n > 1 and float(np.ptp(self.alike[:, phases], axis=0).max()) <= EXACT * span
-        return self.finest * span if same else 0.0
+        return max(self.finest * span if same else 0.0, self.known_to)
+
+    @property
+    def known_to(self) -> float:
+        """What stands for the scatter of closures that repeat as those of a simulator without noise do; 0 of others.
+
+        They differ by rounding alone, and what its sensors round away is the same in each: no model that does not round
+        likewise comes as near as they repeat.
+        """
+        width = self.coarse * float(np.ptp(self.measured))
+        if not (width and self.n > 1):
+            return 0.0
+        scatter = float(np.sqrt(self.alike.var(axis=0, ddof=1).mean()))
+        return width if scatter <= NOISELESS * width else 0.0
 
     @property
     def size(self) -> int:
@@ -316,10 +336,11 @@ def build_features(
     points: int = MAX_PHASES,
     finest: float = FINEST,
     same: float = SAME,
+    coarse: float = 0.0,
 ) -> Features:
     """The operator for these trials and signals, with at most `points` phases to a closure.
 
-    finest  see Block
+    finest, coarse  see Block
     same    see Rig
     Raises HannesError where no trial has any of the signals.
     """
@@ -331,7 +352,7 @@ def build_features(
         for condition in trial.conditions:
             for signal in signals:
                 if signal in trial.signals:
-                    block = _block(trial, number, condition, signal, end, points, finest)
+                    block = _block(trial, number, condition, signal, end, points, finest, coarse)
                     if block is not None:
                         blocks.append(block)
     if not blocks:
@@ -365,7 +386,14 @@ def stands_for_all(trial: Trial) -> bool:
 
 
 def _block(
-    trial: Trial, number: int, condition: str, signal: str, limit: int | None, most: int, finest: float
+    trial: Trial,
+    number: int,
+    condition: str,
+    signal: str,
+    limit: int | None,
+    most: int,
+    finest: float,
+    coarse: float,
 ) -> Block | None:
     time, values = trial.signals[signal]
     closures = trial.of(condition)
@@ -425,6 +453,7 @@ def _block(
         stack(compact) if compact else None,
         trial.unit(signal),
         finest,
+        coarse,
     )
 
 

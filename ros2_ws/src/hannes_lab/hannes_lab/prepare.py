@@ -273,7 +273,9 @@ def prepare(
     wired = "wire.stiffness" in model.names and model.named("wire.stiffness").value > 0.0
     made.one_mass = model.plant == "reduced" and not wired
     told = [] if isinstance(made, HandRig) else [*check_rig(made), *law_notes(made, model)]
-    features = build_features(trials, _present(trials, signals), made.points, made.finest, made.same)
+    features = build_features(
+        trials, _present(trials, signals), made.points, made.finest, made.same, made.coarse
+    )
     nuisances = tuple(made.nuisances(model))
     coordinates = [nuisance_coordinate(n) for n in nuisances]
     view = rig_for(made, model, coordinates, threads) if surrogate else made
@@ -335,6 +337,11 @@ def _what_is_missing(trials: Sequence[Trial], features: Features, rig: Rig) -> l
         if len(where) < len(trials):
             notes.append(f"{signal} is recorded only in {', '.join(where)}")
     notes += drifts(features, rig.machine)
+    if exact := {block.signal: None for block in features.blocks if block.known_to}:
+        notes.append(
+            f"{listed(list(exact))} repeat{'s' if len(exact) == 1 else ''} as those of a simulator without noise do: "
+            f"{100.0 * rig.coarse:g} % of the span counts as scatter, for what sensors round is the same in each"
+        )
     single = [c for c, n in features.closures_of.items() if n == 1]
     if single:
         notes.append(

@@ -149,6 +149,10 @@ class Rig(Protocol):
     def finest(self) -> float:
         """Scatter of closures that is assumed where a coarse sensor shows none, relative to the signal's span."""
 
+    @property
+    def coarse(self) -> float:
+        """Scatter that is assumed of closures without noise, relative to the signal's span; see Block."""
+
     def nuisances(self, model: Model) -> Sequence[Nuisance]:
         """The uncertain nominal parameters with their priors."""
 
@@ -249,6 +253,11 @@ class PlantRig:
     def finest(self) -> float:
         """See Rig; an adapter says it by `floor`."""
         return self.floor
+
+    @property
+    def coarse(self) -> float:
+        """See Rig: an adapter's `floor` counts beside what the closures scatter, however little that is."""
+        return 0.0
 
     def identity(self) -> tuple[Any, ...]:
         """What its simulations depend on beside the model: for the hash under which results are kept."""

@@ -63,7 +63,7 @@ class AnchoredRig:
         self._exacts = [exact]
         self._ends = ends or {trial.name: compact_end(trial) for trial in exact.trials}
         self.trials = exact.trials
-        self.floor, self.finest = exact.floor, exact.finest
+        self.floor, self.finest, self.coarse = exact.floor, exact.finest, exact.coarse
         self.points, self.same, self.pooled = exact.points, exact.same, exact.pooled
         self.approximate, self.foreign = True, exact.foreign
         self.drive_signals, self.without = exact.drive_signals, exact.without
