@@ -4,6 +4,7 @@ import json
 import math
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,10 +12,11 @@ import numpy as np
 import pytest
 import yaml
 from hannes_description.model import EffectEntry, Model
+from hannes_lab import cli
 from hannes_lab.cli_files import check_writable
 from hannes_lab.cli_show import _show_conditions, relative_error
 from hannes_lab.compare import MetricRow
-from hannes_lab.diagnosis import Fall
+from hannes_lab.diagnosis import Diagnosis, Fall
 from hannes_lab.hide import make_set, visibility
 from hannes_lab.wording import condition_apart, failure_notes
 from hannes_sim.effect import load_effect, strength_of
@@ -526,3 +528,20 @@ def test_what_was_not_looked_for_may_be_in_the_catalogue(
     assert (
         "is not one of those that were looked for (supply_sag)" in said and "not in the catalogue" not in said
     )
+
+
+@pytest.mark.parametrize(
+    ("effects", "said"),
+    (
+        ((), "the fitted nominal model, which does not explain the recordings"),
+        (("an effect",), "of the nearest effects, which are no finding"),
+    ),
+)
+def test_the_model_file_of_an_unknown_says_that_it_is_no_finding(
+    effects: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
+    found = object.__new__(Diagnosis)
+    model = replace(Model.load(), provenance={"recordings": {}})
+    for name, value in {"verdict": "unknown", "effects": effects, "model": model}.items():
+        object.__setattr__(found, name, value)
+    assert cli._model_file(found, tmp_path / "mine.yaml").remark == said

@@ -325,8 +325,12 @@ def _model_file(found: Diagnosis | Addition, path: Path) -> Output:
     from .diagnosis import Diagnosis
     from .provenance import own_command, save_model
 
-    nearest = isinstance(found, Diagnosis) and found.verdict == "unknown" and found.effects
-    remarks = ["of the nearest effects, which are no finding"] if nearest else []
+    remarks = []
+    if isinstance(found, Diagnosis) and found.verdict == "unknown":
+        nearest = "of the nearest effects, which are no finding"
+        remarks = [
+            nearest if found.effects else "the fitted nominal model, which does not explain the recordings"
+        ]
     left_out = sorted({name.partition("@")[0] for name in found.model.provenance["recordings"]})
     if left_out:
         remarks.append(f"without what is of the recordings: {', '.join(left_out)}")

@@ -1,11 +1,14 @@
-"""`hannes model`: what a model file says."""
+"""`hannes model`: what a model file says, and one with other values."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from hannes_description.errors import HannesError
 from hannes_description.output import number, print_json, print_table
 
 from .options import JsonOption
@@ -94,6 +97,79 @@ def _known_to(p: Parameter) -> str:
     if p.tolerance is None:
         return ""
     return f"{100 * p.tolerance:.3g} %" if p.tolerance else "exactly"
+
+
+@app.command()
+def change(
+    model: Annotated[str, typer.Argument(help="Name of a shipped model, or path of a model file.")],
+    out: Annotated[Path, typer.Option("--out", help="Model file to write.")],
+    effects: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--effect", help="Effect to add, by name or your own as path.py:Class, at its typical values."
+        ),
+    ] = None,
+    values: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="NAME=NUMBER in the parameter's unit, as motor.kt=0.0172 or, of an effect, cogging.sine=0.01.",
+        ),
+    ] = None,
+) -> None:
+    """Write a model file with effects or values of your choice, to see what the hand would do: nothing is fitted."""
+    from hannes_description.model import Model
+    from hannes_lab.cli_files import check_model_file
+    from hannes_lab.provenance import own_command, save_model
+    from hannes_sim.effect import catalogue, effect_source, load_effect
+    from hannes_sim.factory import make_plant
+
+    check_model_file(out)
+    changed, where = Model.load(model), "hannes model change"
+    sources = {
+        load_effect(entry.source or entry.name).name: entry.source or entry.name for entry in changed.effects
+    }
+    sources |= {load_effect(source).name: source for source in effects or ()}
+    given = _numbers(values or ())
+    for name, source in sources.items():
+        own = {n.removeprefix(f"{name}."): v for n, v in given.items() if n.startswith(f"{name}.")}
+        before = (
+            {} if source in (effects or ()) else next(e.values for e in changed.effects if e.name == name)
+        )
+        if own or not before:
+            entry = load_effect(source).entry({**before, **own}, source=effect_source(source), where=where)
+            changed = changed.with_effect(entry)
+    plain = {n: v for n, v in given.items() if n.partition(".")[0] not in sources}
+    for name, value in plain.items():
+        if (group := name.partition(".")[0]) in catalogue():
+            raise HannesError(f"--set {name}: the model has no effect '{group}'; add it by --effect {group}.")
+        p = changed.parameters[name]
+        if not p.lower <= value <= p.upper:
+            raise HannesError(
+                f"--set {name}={value:g}: outside its bounds, {p.lower:g} .. {p.upper:g} {p.unit}; a model file that "
+                "gives bounds of its own takes it."
+            )
+    changed = changed.with_values(plain, status="assumed", source=where)
+    make_plant(changed)
+    save_model(changed, out, own_command())
+    typer.echo(f"Model file: {out}")
+
+
+def _numbers(texts: Sequence[str]) -> dict[str, float]:
+    """Values by name."""
+    out: dict[str, float] = {}
+    for text in texts:
+        name, _, number_ = text.rpartition("=")
+        try:
+            value = float(number_)
+        except ValueError:
+            value = math.nan
+        if not (name and math.isfinite(value)):
+            raise HannesError(f"--set {text}: give NAME=NUMBER, such as motor.kt=0.0172.")
+        if name in out:
+            raise HannesError(f"--set {name} is given more than once; give one number.")
+        out[name] = value
+    return out
 
 
 @app.command()
