@@ -67,11 +67,9 @@ def noise_draws(problem: Problem, draws: int, rng: np.random.Generator) -> tuple
         scale = np.sqrt(m / (m - 1.0))
         for k in range(draws):
             raw[rows, k] = block.combine(signs[k][:, None] * deviation[which[k]]) * scale
-        if block.known_to:
+        if known_to := block.known_to * np.sqrt(n):
             for k in range(draws):
-                raw[rows, k] += block.combine(
-                    block.known_to * np.sqrt(n) * rng.standard_normal((n, block.phase.size))
-                )
+                raw[rows, k] += block.combine(known_to * rng.standard_normal((n, block.phase.size)))
     for own, lower in problem.discrepancy:
         raw[own] += lower @ rng.standard_normal((own.size, draws))
     return problem.whiten(raw), True
