@@ -47,6 +47,7 @@ def test_effects_and_values_are_written_and_changed_again(
         (("--effect", "cogging", "--set", "cogging.sine=9"), "outside [-0.1, 0.1]"),
         (("--effect", "cogging", "--set", "cogging.amplitude=1"), "has no parameter amplitude"),
         (("--effect", "coging"), "Unknown effect 'coging'"),
+        (("--effect", "cogging", "--effect", "cogging"), "the model has 'cogging' already"),
         (("--set", "motor.kt=0.017", "--set", "motor.kt=0.018"), "given more than once"),
     ),
 )

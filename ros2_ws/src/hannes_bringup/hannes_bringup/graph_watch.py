@@ -196,6 +196,10 @@ class _SimulatedTime:
             return 0.0
         first, last = (_seconds(said[k]) for k in (0, -1))
         elapsed = last - (first if self._last is None else self._last)
+        if elapsed < 0.0:
+            raise HannesError(
+                "/clock went back: the hand began again during the profile. What came is in the bag; record again."
+            )
         self._last = last
         return elapsed
 

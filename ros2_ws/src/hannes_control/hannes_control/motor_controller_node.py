@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from time import monotonic
 
 import hannes_ros.early  # noqa: F401  (signals are safe from here on)
+import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_ros import topics
@@ -53,6 +54,13 @@ class MotorControllerParameters:
     reference_period: float = parameter(
         0.0, "period of the profile, 0 for its own", lower=0.0, upper=1e3, unit="s"
     )
+    reference_rest: float = parameter(
+        0.0,
+        "rest before the profile: a recording begins before what it records",
+        lower=0.0,
+        upper=1e3,
+        unit="s",
+    )
     reference_subscribers: int = parameter(
         0, "subscribers that the reference must have before a profile of its own begins", lower=0, upper=100
     )
@@ -79,13 +87,14 @@ class MotorControllerParameters:
         if self.reference == "topic":
             return None
         options = {"period": self.reference_period} if self.reference_period > 0.0 else {}
-        return make_profile(
+        moves = make_profile(
             self.reference,
             closures=self.reference_closures,
             amplitude=self.reference_amplitude,
             dt=self.period,
             **options,
         )
+        return np.concatenate([np.full(round(self.reference_rest / self.period), moves[0]), moves])
 
 
 class MotorController(HannesNode, LifecycleNode):

@@ -147,9 +147,10 @@ def as_compared(
     """
     if rig is not None:
         trials = [trial.aligned() for trial in join_trials(check_trials(trials, rig.__name__))]
-    if leave_out:
-        trials = without_named(trials, leave_out)
-    return trials if typical else [without_outliers(trial) for trial in trials]
+    if not typical:
+        trials = [without_outliers(trial) for trial in trials]
+    # Numbers are those of `hannes trials`, which shows what is left of them.
+    return without_named(trials, leave_out) if leave_out else trials
 
 
 def without_named(trials: Sequence[Trial], given: Mapping[str, Sequence[int]]) -> list[Trial]:
@@ -164,7 +165,7 @@ def without_named(trials: Sequence[Trial], given: Mapping[str, Sequence[int]]) -
     for trial in trials:
         gone: set[int] = set()
         notes = []
-        for name in given.keys() & set(trial.conditions):
+        for name in (name for name in given if name in trial.conditions):
             own, numbers = trial.numbers[name], sorted(set(given[name]))
             if numbers[-1] > len(own):
                 raise HannesError(f"--leave-out {name}={numbers[-1]}: '{name}' has {len(own)} closures only.")

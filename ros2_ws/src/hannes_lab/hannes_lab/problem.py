@@ -339,7 +339,7 @@ def build_problem(
     for block, e in zip(features.blocks, deviations, strict=True):
         span = float(np.ptp(block.measured)) or 1.0
         floor = (rig.floor * span) ** 2
-        variances.append(sample_variance(block.measured, e) + max(floor, _known_to(block)))
+        variances.append(sample_variance(block.measured, e) + floor)
     if rig.pooled:
         variances = _pooled(features, variances)
     columns: list[list[Array]] = []
@@ -394,28 +394,17 @@ def _covariance_of_one(
     """Covariance of one closure over the phases of the blocks `own` of one recording and condition, one after another.
 
     jacobian   (phases, k) sensitivities to the scatter
-    Where signals cover different numbers of closures, those that cover the most tell the scatter.  Where none has any
-    noise, there is no scatter, whatever is usual.
+    Where signals cover different numbers of closures, those that cover the most tell the scatter.
     """
     v = np.concatenate([variances[k] for k in own])
-    if all(features.blocks[k].known_to for k in own):
-        return np.diag(v)
     power = np.ones(jacobian.shape[1])
     most = max(features.blocks[k].n for k in own)
     if most >= 3 and jacobian.shape[1]:
         full = [k for k in own if features.blocks[k].n == most]
         told = np.concatenate([np.full(variances[k].size, features.blocks[k].n == most) for k in own])
         e = np.concatenate([deviations[k] for k in full], axis=1)
-        least = np.concatenate([np.full(variances[k].size, _known_to(features.blocks[k])) for k in own])
-        power, left = _estimate_scatter(e, jacobian[told], v[told])
-        v[told] = np.maximum(left, least[told])
+        power, v[told] = _estimate_scatter(e, jacobian[told], v[told])
     return np.asarray(np.diag(v) + (jacobian * power) @ jacobian.T)
-
-
-def _known_to(block: Block) -> float:
-    """Variance of a sample of closures without noise, such that their mean is known to `known_to`: what rounding
-    leaves is the same in each; 0 of others."""
-    return block.n * block.known_to**2
 
 
 def _pooled(features: Features, variances: Sequence[Array]) -> list[Array]:

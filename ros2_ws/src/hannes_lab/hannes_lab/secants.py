@@ -53,7 +53,7 @@ def over_its_spread(problem: Problem, found: Fit) -> Fit:
 
 
 def grain_of(problem: Problem, found: Fit) -> float:
-    """Standard deviation of what the misfit jumps by from place to place within a fifth of the intervals.
+    """Standard deviation of what the misfit jumps by from place to place beside a fit.
 
     A law that computes in whole numbers makes the misfit a staircase in all parameters at once, and a fit ends in a
     hole of it.  Of any parabola f(d) + f(-d) - 4 f(d / 2) - 4 f(-d / 2) + 6 f(0) is nought, and of jumps that know
@@ -63,7 +63,8 @@ def grain_of(problem: Problem, found: Fit) -> float:
     if not found.coordinates:
         return 0.0
     low, high = np.array([c.bounds for c in found.coordinates]).T
-    room = np.maximum(np.minimum(high - found.z, found.z - low), 0.0)
+    most = np.array([longest_step(c, float(z)) for c, z in zip(found.coordinates, found.z, strict=True)])
+    room = np.clip(np.minimum(high - found.z, found.z - low), 0.0, most)
     sizes, axes = np.linalg.eigh(found.covariance())
     spread = axes * np.sqrt(np.maximum(sizes, 0.0))
 

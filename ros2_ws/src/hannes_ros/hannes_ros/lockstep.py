@@ -53,7 +53,8 @@ class Pace:
 
     Each node answers each tick, so those of the loop cannot fall behind; but a publisher keeps a limited number of
     messages, and what a slow listener has not got by then is lost.  So all wait until it has caught up, which it says
-    at the next heartbeat of the middleware (0.02 s with this project's profile).
+    at the next heartbeat of the middleware (0.02 s with this project's profile), or for UNHEARD_S: one that was stopped
+    loses messages all the same.
 
     outputs  the first one is that which all of the loop hear
     """

@@ -70,9 +70,9 @@ def message_type(name: str) -> type:
     return MESSAGE_TYPES[signal(name).type]
 
 
-def qos(name: str, each_tick: int = _TICK_DEPTH) -> QoSProfile:
-    """QoS of the topic that carries the signal, with the depth of those that come at each tick."""
-    return _reliable(each_tick if signal(name).topic in _EACH_TICK else _SLOW_DEPTH)
+def qos(name: str, depth: int = _TICK_DEPTH) -> QoSProfile:
+    """QoS of the topic that carries the signal; depth: that of a signal which comes at each tick."""
+    return _reliable(depth if signal(name).topic in _EACH_TICK else _SLOW_DEPTH)
 
 
 def publisher(node: Node, name: str, on_match: Callable[[Any], None] | None = None) -> Publisher:

@@ -289,9 +289,9 @@ class HandSim(HannesNode, Node):
         if self._clock_heard:
             self._sim_clock.publish(convert.clock_bytes(stamp_ns))
         self._waiting = True
-        self._watch.published(monotonic())
         self._publish(stamp_ns)
         self._pace.after(self._tick)
+        self._watch.published(monotonic())
 
     def _on_tick_voltage(self, data: bytes) -> None:
         if not self._waiting:

@@ -78,6 +78,9 @@ def record(
 SEEK = 10.0
 """s in which a hand that runs is found."""
 
+BEFORE = 0.5
+"""s of rest that are recorded before a profile: of a closure that begins with its recording, that is missing."""
+
 
 def _record_profile(
     recorder: dict[str, Any],
@@ -99,7 +102,7 @@ def _record_profile(
     from .run import NODES
 
     given = {name: value for name, value in (("period", period), ("amplitude", amplitude)) if value > 0.0}
-    seconds = make_profile(profile, closures=closures, **given).size * 1e-3
+    seconds = BEFORE + make_profile(profile, closures=closures, **given).size * 1e-3
     name = str(Path(model).absolute()) if Path(model).suffix in (".yaml", ".yml") else model or "nominal"
     loaded = Model.load(name)
     check_travel(amplitude or FULL_CLOSURE, loaded.parameters)
@@ -109,7 +112,7 @@ def _record_profile(
             "move the hand by a controller of your own, and record without --profile."
         )
     controller: dict[str, Any] = {"reference": profile, "reference_closures": closures, "model": name}
-    controller |= {f"reference_{name}": value for name, value in given.items()}
+    controller |= {f"reference_{name}": value for name, value in (given | {"rest": BEFORE}).items()}
     require_ros()
     apply_ros_environment()
     from hannes_bringup.graph_watch import (
@@ -134,6 +137,8 @@ def _record_profile(
             recording = [*find_command(NODES["recorder"], "recorder", environment), *_words(recorder, more)]
             group.start("recorder", recording)
             wait_for_recorder(lambda: bool(group.running))
+            if not group.running:
+                raise typer.Exit(2)
             driving = find_command(NODES["motor_controller"], "motor_controller", environment)
             group.start("motor_controller", [*driving, *_words(controller, [])])
             disturbed = follow_profile(seconds, lambda: len(group.running) == 2, lockstep=lockstep)

@@ -126,30 +126,24 @@ def change(
 
     check_model_file(out)
     changed, where = Model.load(model), "hannes model change"
-    sources = {
-        load_effect(entry.source or entry.name).name: entry.source or entry.name for entry in changed.effects
-    }
-    sources |= {load_effect(source).name: source for source in effects or ()}
     given = _numbers(values or ())
-    for name, source in sources.items():
-        own = {n.removeprefix(f"{name}."): v for n, v in given.items() if n.startswith(f"{name}.")}
-        before = (
-            {} if source in (effects or ()) else next(e.values for e in changed.effects if e.name == name)
-        )
-        if own or not before:
-            entry = load_effect(source).entry({**before, **own}, source=effect_source(source), where=where)
-            changed = changed.with_effect(entry)
-    plain = {n: v for n, v in given.items() if n.partition(".")[0] not in sources}
-    for name, value in plain.items():
-        if (group := name.partition(".")[0]) in catalogue():
+    for source in effects or ():
+        kind = load_effect(source)
+        if any(entry.name == kind.name for entry in changed.effects):
+            raise HannesError(f"--effect {source}: the model has '{kind.name}' already; --set changes it.")
+        own = {n.removeprefix(f"{kind.name}."): v for n, v in given.items() if n.startswith(f"{kind.name}.")}
+        changed = changed.with_effect(kind.entry(own, source=effect_source(source), where=where))
+        given = {n: v for n, v in given.items() if not n.startswith(f"{kind.name}.")}
+    for name, value in given.items():
+        if name not in changed.names and (group := name.partition(".")[0]) in catalogue():
             raise HannesError(f"--set {name}: the model has no effect '{group}'; add it by --effect {group}.")
-        p = changed.parameters[name]
+        p = changed.named(name)
         if not p.lower <= value <= p.upper:
             raise HannesError(
                 f"--set {name}={value:g}: outside its bounds, {p.lower:g} .. {p.upper:g} {p.unit}; a model file that "
                 "gives bounds of its own takes it."
             )
-    changed = changed.with_values(plain, status="assumed", source=where)
+    changed = changed.with_values(given, status="assumed", source=where)
     make_plant(changed)
     save_model(changed, out, own_command())
     typer.echo(f"Model file: {out}")
