@@ -153,9 +153,9 @@ def _numbers(texts: Sequence[str]) -> dict[str, float]:
     """Values by name."""
     out: dict[str, float] = {}
     for text in texts:
-        name, _, number_ = text.rpartition("=")
+        name, _, figure = text.rpartition("=")
         try:
-            value = float(number_)
+            value = float(figure)
         except ValueError:
             value = math.nan
         if not (name and math.isfinite(value)):
