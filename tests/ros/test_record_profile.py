@@ -17,7 +17,7 @@ import pytest
 from graph import NodeProcess, Peer, processes
 from hannes_bags.reading import read_bag
 from hannes_bringup import graph_watch
-from hannes_bringup.graph_watch import follow_profile, is_recorded, require_free_hand
+from hannes_bringup.graph_watch import find_free_hand, follow_profile, is_recorded
 from hannes_control.reference import make_profile
 from hannes_description.errors import HannesError
 from hannes_ros import convert
@@ -50,6 +50,26 @@ def hand(peer: Peer, seconds: float) -> Iterator[None]:
         other.join()
 
 
+def record(
+    bag: Path, environment: dict[str, str], *, closures: int, period: float
+) -> subprocess.CompletedProcess[str]:
+    """`hannes record` with a half sine, to its end."""
+    words = (
+        "record",
+        str(bag),
+        "--profile",
+        "half_sine",
+        "--closures",
+        str(closures),
+        "--period",
+        str(period),
+    )
+    return subprocess.run(
+        [sys.executable, "-m", "hannes_bringup.cli", *words],
+        env=environment, capture_output=True, text=True, timeout=PATIENCE,
+    )  # fmt: skip
+
+
 def test_a_profile_is_recorded_to_its_end(
     tmp_path: Path, peer: Peer, ros_environment: dict[str, str]
 ) -> None:
@@ -57,11 +77,7 @@ def test_a_profile_is_recorded_to_its_end(
     with hand(peer, PATIENCE):
         for attempt in range(4):
             bag = tmp_path / f"bag{attempt}"
-            words = ("record", str(bag), "--profile", "half_sine", "--closures", "1", "--period", "2")
-            told = subprocess.run(
-                [sys.executable, "-m", "hannes_bringup.cli", *words],
-                env=ros_environment, capture_output=True, text=True, timeout=PATIENCE,
-            )  # fmt: skip
+            told = record(bag, ros_environment, closures=1, period=2.0)
             if told.returncode == 0:
                 break
             assert 'the controller says "' in told.stderr
@@ -82,20 +98,7 @@ def test_profiles_of_a_hand_in_lockstep_are_recorded_whole_one_after_the_other(
     curves = []
     with processes(NodeProcess("hand_sim", clock="lockstep", object="soft", command_timeout_ms=1000.0)):
         for name in ("first", "second"):
-            words = (
-                "record",
-                str(tmp_path / name),
-                "--profile",
-                "half_sine",
-                "--closures",
-                "2",
-                "--period",
-                "1.5",
-            )
-            told = subprocess.run(
-                [sys.executable, "-m", "hannes_bringup.cli", *words],
-                env=ros_environment, capture_output=True, text=True, timeout=PATIENCE,
-            )  # fmt: skip
+            told = record(tmp_path / name, ros_environment, closures=2, period=1.5)
             assert told.returncode == 0, told.stderr
             read = read_bag(tmp_path / name)
             assert read.metadata["plant"] == "reduced" and read.metadata["object"] == "soft"
@@ -109,9 +112,8 @@ def test_profiles_of_a_hand_in_lockstep_are_recorded_whole_one_after_the_other(
             encoder = read["encoder_position"]
             assert np.ptp(np.diff(np.unique(encoder.time))) < 1e-6, "a tick is missing"
             curves.append(np.interp(reference.time[0] + 1e-3 * np.arange(3000), encoder.time, encoder.values))
-    np.testing.assert_allclose(
-        curves[1], curves[0], atol=0.06
-    )  # the first one began where nothing was wound up
+    # The first one began where nothing was wound up.
+    np.testing.assert_allclose(curves[1], curves[0], atol=0.06)
     assert curves[0].max() > 5.0
 
 
@@ -143,10 +145,10 @@ def test_who_hears_the_reference_of_a_profile() -> None:
 
 def test_a_profile_is_refused_where_it_would_mix_with_another_reference(peer: Peer) -> None:
     peer.publisher("encoder_position")
-    require_free_hand(PATIENCE)
+    find_free_hand(PATIENCE)
     peer.publisher("reference_position")
     with pytest.raises(HannesError, match="reference_position is published already, by peer"):
-        require_free_hand(PATIENCE)
+        find_free_hand(PATIENCE)
 
 
 def controller_runs(peer: Peer) -> None:

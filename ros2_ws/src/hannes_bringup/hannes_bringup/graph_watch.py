@@ -97,7 +97,7 @@ def watch(window: float, context: Context | None = None) -> GraphSeen:
         return _watch(node, executor, window)
 
 
-def require_free_hand(timeout: float) -> bool:
+def find_free_hand(timeout: float) -> bool:
     """Whether the hand that runs is in lock-step: it takes voltages, and tells the time.
 
     Raises a HannesError where no hand is found within `timeout` seconds (nobody who publishes motor/state), or where

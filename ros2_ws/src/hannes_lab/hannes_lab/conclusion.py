@@ -11,8 +11,10 @@ from .adequacy import shortfall
 from .chance import Chance
 from .choose import Choice
 from .diagnosis import Fall, FoundEffect
+from .errors import SignalError
 from .falls import fall_sentence
 from .prepare import FEW
+from .problem import Problem
 from .report_text import UNKNOWN, listed, words
 from .search import Candidate, Search
 from .twins import twins
@@ -108,21 +110,8 @@ class Conclusion:
         nearest = "" if choice.idle or self.greedy else nearest_sentence(choice)
         far = self._far
         return (
-            f"Nothing is missing: with its own parameters fitted, {explained}{other}. {self._fall}{self._largest}"
-            f"{far and far + nearest}"
-        )
-
-    @property
-    def _largest(self) -> str:
-        """Where a model that has an error of its own misses most, and what that hides; empty where it is little."""
-        known = [e for e in self.falls[-1].signals if math.isfinite(e.ratio)]
-        worst = max(known, key=lambda e: e.ratio, default=None)
-        if worst is None or worst.ratio < MUCH or not self.search.problem.discrepancy:
-            return ""
-        return (
-            f" It is largest in {words(worst.signal)} of '{worst.condition}', {worst.ratio:.1f} times the "
-            "repeatability: of another machine the form of the model may be off by as much, and what leaves less is "
-            "not seen."
+            f"Nothing is missing: with its own parameters fitted, {explained}{other}. {self._fall}"
+            f"{missed_most(self.search.problem, self.falls[-1].signals)}{far and far + nearest}"
         )
 
     def _effects(self) -> str:
@@ -169,6 +158,18 @@ class Conclusion:
     @property
     def _far(self) -> str:
         return _moved_far(self.best, twins(self.search, self.best, far_off(self.best)))
+
+
+def missed_most(problem: Problem, errors: Sequence[SignalError]) -> str:
+    """Where a model that has an error of its own misses most, and what that hides; empty where it is little."""
+    known = [e for e in errors if math.isfinite(e.ratio)]
+    worst = max(known, key=lambda e: e.ratio, default=None)
+    if worst is None or worst.ratio < MUCH or not problem.discrepancy:
+        return ""
+    return (
+        f" It is largest in {words(worst.signal)} of '{worst.condition}', {worst.ratio:.1f} times the repeatability: "
+        "of another machine the form of the model may be off by as much, and what leaves less is not seen."
+    )
 
 
 def _named(names: Sequence[str]) -> str:

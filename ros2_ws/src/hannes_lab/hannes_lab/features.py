@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -108,7 +108,7 @@ class Block:
         same = self.n > 1 and float(np.ptp(self.alike[:, phases], axis=0).max()) <= EXACT * span
         return max(self.finest * span if same else 0.0, self.known_to)
 
-    @property
+    @cached_property
     def known_to(self) -> float:
         """What stands for the scatter of closures that repeat as those of a simulator without noise do; 0 of others.
 

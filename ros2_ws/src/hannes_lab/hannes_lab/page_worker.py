@@ -110,12 +110,7 @@ def work(task: Mapping[str, Any], folder: Path, say: Say) -> None:
     progress = _Progress(say)
     say({"kind": "effects", "titles": {name: kind.title for name, kind in catalogue().items()}})
     progress(0, 1, "reading the bags")
-    objects, signals, rig, scale, topics, leave_out = (
-        task.get(k) for k in ("objects", "signals", "rig", "scale", "topics", "leave_out")
-    )
-    prepared = prepared_from(
-        task["bags"], task["model"], objects, signals, rig, scale, task["jobs"], topics, leave_out
-    )
+    prepared = prepared_from(task["bags"], threads=task["jobs"], **{name: task.get(name) for name in FIT})
     progress(1, 1, "reading the bags")
     notes = list(prepared.notes)
     say({"kind": "data", "data": data_used(prepared.features), "notes": notes, "model": prepared.model.name})

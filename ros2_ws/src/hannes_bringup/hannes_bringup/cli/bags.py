@@ -112,22 +112,23 @@ def _record_profile(
             "move the hand by a controller of your own, and record without --profile."
         )
     controller: dict[str, Any] = {"reference": profile, "reference_closures": closures, "model": name}
-    controller |= {f"reference_{name}": value for name, value in (given | {"rest": BEFORE}).items()}
+    controller["reference_rest"] = BEFORE
+    controller |= {f"reference_{name}": value for name, value in given.items()}
     require_ros()
     apply_ros_environment()
     from hannes_bringup.graph_watch import (
         REFERENCE,
         VOLTAGE,
+        find_free_hand,
         follow_profile,
         is_recorded,
-        require_free_hand,
         wait_for_recorder,
     )
 
     recorded = [] if any(word.startswith("topics:=") for word in more) else recorder.get("topics")
     # `follow_profile` hears the reference from its begin on too, and the hand the voltage
     controller["reference_subscribers"] = 1 + is_recorded(REFERENCE, recorded)
-    lockstep = require_free_hand(SEEK)
+    lockstep = find_free_hand(SEEK)
     if lockstep:
         controller |= {"clock": "lockstep", "subscribers": 1 + is_recorded(VOLTAGE, recorded)}
     environment = ros_environment()
