@@ -43,8 +43,8 @@ from hannes_lab.hand import HAND_ZERO
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import Problem, nuisance_coordinate, values_at
+from hannes_lab.recorded import make_trial
 from hannes_lab.rig import Nuisance
-from hannes_lab.trials import make_trial
 from hannes_sim.effect import load_effect
 from joblib import Parallel, delayed
 from numpy.typing import NDArray

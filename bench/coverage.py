@@ -14,7 +14,8 @@ from hannes_description.model import Model
 from hannes_lab.calibrate import LARGE_MISFIT, calibrate
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
-from hannes_lab.trials import make_trial, unique_names
+from hannes_lab.recorded import make_trial
+from hannes_lab.trials import unique_names
 
 
 def main() -> None:

@@ -29,7 +29,8 @@ from hannes_description.model import Model
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import load_trials, prepare
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.recorded import make_trial
+from hannes_lab.trials import Trial
 from hannes_sim.effect import strength_of
 from joblib import Parallel, delayed
 from rosbags.rosbag2 import StoragePlugin, Writer

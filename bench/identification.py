@@ -37,8 +37,9 @@ from hannes_lab.fit import fit
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import Truth, make_set
 from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.recorded import make_trial
 from hannes_lab.search import Search
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.trials import Trial
 from hannes_sim.effect import catalogue, effect_source, load_effect
 from joblib import Parallel, delayed
 

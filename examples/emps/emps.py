@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from hannes_description.control_ports import C_PERIOD, C_POSITION, C_REFERENCE
 from hannes_description.errors import HannesError
+from hannes_lab.closures import find_moves
 from hannes_lab.rig import PlantRig
-from hannes_lab.trials import Closure, Trial, find_moves
+from hannes_lab.trials import Closure, Trial
 from hannes_sim.native import CONTROL_SIGNATURE
 from hannes_sim.rollout import Rollout
 from numba import cfunc
@@ -90,9 +91,8 @@ class Emps(PlantRig):
         period = round(float(np.median(np.diff(t))), 6)
         grid = np.arange(t.size) * period
         at = [round(1e3 * float(r)) for r in reference]
-        found = find_moves(reference, period)
-        moves = [(a, b, at[round(a / period)], at[round(b / period)]) for a, b in found]
-        closures = [Closure(a, b, f"{start} to {stop} mm") for a, b, start, stop in moves]
+        moves = find_moves(reference, period)
+        closures = [Closure(a, b, f"{at[round(a / period)]} to {at[round(b / period)]} mm") for a, b in moves]
         signals = {"drive_force": (grid, float(gtau[0]) * voltage), "encoder_position": (grid, position)}
         return Trial("emps", period, reference, signals, tuple(closures), {"gtau": float(gtau[0])}, str(path),
                      hashlib.sha256(path.read_bytes()).hexdigest(),

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 from hannes_description.control_ports import C_POSITION, C_REFERENCE, C_VELOCITY
 from hannes_description.errors import HannesError
+from hannes_lab.closures import find_moves
 from hannes_lab.rig import PlantRig
-from hannes_lab.trials import Closure, Trial, find_moves
+from hannes_lab.trials import Closure, Trial
 from hannes_sim.native import CONTROL_SIGNATURE
 from numba import cfunc
 

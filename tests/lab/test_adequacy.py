@@ -13,9 +13,9 @@ from hannes_lab.fit import Fit
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.problem import Coordinate, effect_coordinates, nuisance_coordinate
+from hannes_lab.recorded import make_trial
 from hannes_lab.rig import Nuisance
 from hannes_lab.search import Candidate, Search
-from hannes_lab.trials import make_trial
 from hannes_sim.effect import load_effect
 
 

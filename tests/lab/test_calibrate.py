@@ -15,8 +15,9 @@ from hannes_lab.calibrate import _key, calibrate
 from hannes_lab.hide import make_set
 from hannes_lab.identify import free_coordinates, identify, search
 from hannes_lab.prepare import prepare
+from hannes_lab.recorded import make_trial
 from hannes_lab.remembered import Remembered
-from hannes_lab.trials import make_trial, unique_names
+from hannes_lab.trials import unique_names
 from hannes_lab.validation.targets import Target, TargetProblem, calibrate_targets
 
 NOMINAL = Model.load("nominal")

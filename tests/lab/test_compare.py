@@ -15,7 +15,8 @@ from hannes_lab.features import Features
 from hannes_lab.hand import make_controller
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.recorded import make_trial
+from hannes_lab.trials import Trial
 from hannes_sim.effect import strength_of
 from hannes_sim.factory import make_plant
 from hannes_sim.measurement import SENSORS

@@ -25,8 +25,8 @@ from hannes_lab.fit import Fit, fit
 from hannes_lab.hide import DEFAULT_CONDITIONS, Truth, make_set
 from hannes_lab.intervals import intervals_of
 from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.recorded import make_trial
 from hannes_lab.search import Candidate, Search
-from hannes_lab.trials import make_trial
 from hannes_lab.wording import bent_sentence, law_sentence, notes, worse_fitted
 from hannes_sim.effect import load_effect, strength_of
 

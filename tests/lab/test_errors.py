@@ -18,8 +18,8 @@ from hannes_lab.errors import (
 from hannes_lab.features import Block
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
+from hannes_lab.recorded import make_trial
 from hannes_lab.search import Candidate, Search
-from hannes_lab.trials import make_trial
 from hannes_sim.effect import strength_of
 
 

@@ -12,8 +12,9 @@ from hannes_lab.experiments import VISIBLE, separating_experiments
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.recorded import make_trial
 from hannes_lab.search import Candidate, Search
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.trials import Trial
 from hannes_sim.effect import strength_of
 from hannes_sim.plant import PlantDiverged
 

@@ -8,7 +8,8 @@ from hannes_description.model import Model
 from hannes_lab.features import build_features, compact_end
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
-from hannes_lab.trials import SAME, Trial, make_trial
+from hannes_lab.recorded import make_trial
+from hannes_lab.trials import SAME, Trial
 from hannes_sim.effect import load_effect
 
 SIGNALS = ("encoder_position", "motor_current")

@@ -10,8 +10,8 @@ from hannes_lab.fit import Derivatives, Fit, finite_differences, fit, prior_weig
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import Coordinate, Problem, nuisance_coordinate
+from hannes_lab.recorded import make_trial
 from hannes_lab.secants import over_its_spread
-from hannes_lab.trials import make_trial
 from scipy.optimize import least_squares
 
 

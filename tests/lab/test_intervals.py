@@ -17,9 +17,9 @@ from hannes_lab.hide import make_set
 from hannes_lab.intervals import NORMAL, intervals_of, may_vanish, strain, sway, wider
 from hannes_lab.prepare import prepare
 from hannes_lab.problem import Coordinate
+from hannes_lab.recorded import make_trial
 from hannes_lab.search import FAR, Search
 from hannes_lab.secants import grain_of
-from hannes_lab.trials import make_trial
 from hannes_lab.twins import imitation, twins
 from hannes_lab.wording import far_off, jumps
 from hannes_sim.effect import EffectParameter, load_effect

@@ -17,7 +17,8 @@ from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
 from hannes_lab.join import ENOUGH, Loaded, join_repeats
 from hannes_lab.prepare import load_trials, prepare, without_named
-from hannes_lab.trials import SAME, make_trial
+from hannes_lab.recorded import make_trial
+from hannes_lab.trials import SAME
 from hannes_sim.effect import strength_of
 from lab.foreign_bags import hannes
 

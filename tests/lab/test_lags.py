@@ -12,7 +12,8 @@ from hannes_lab.hand import outer_loop
 from hannes_lab.hide import make_set
 from hannes_lab.lags import lags, lags_to_voltage, with_one_clock
 from hannes_lab.prepare import prepare
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.recorded import make_trial
+from hannes_lab.trials import Trial
 from hannes_sim.effect import catalogue, strength_of
 
 QUICK = ("fast", "grasp_fast")

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from hannes_description.control_ports import C_PERIOD, C_POSITION, C_REFERENCE, C_VELOCITY
 from hannes_description.model import Model
+from hannes_lab.closures import find_moves
 from hannes_lab.join import join_trials
 from hannes_lab.law_check import law_notes
 from hannes_lab.prepare import prepare
 from hannes_lab.rig import PlantRig, load_rig
-from hannes_lab.trials import Closure, Trial, find_moves
+from hannes_lab.trials import Closure, Trial
 from hannes_sim.factory import make_plant
 from hannes_sim.native import CONTROL_SIGNATURE
 from hannes_sim.rollout import Rollout, rollout

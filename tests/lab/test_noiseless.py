@@ -13,7 +13,8 @@ from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.features import NOISELESS
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.recorded import make_trial
+from hannes_lab.trials import Trial
 from hannes_sim.effect import strength_of
 from hannes_sim.measurement import Sensors
 

@@ -19,8 +19,9 @@ from hannes_lab.diagnosis import Diagnosis
 from hannes_lab.hand import OWN_ERROR_DRIVE, model_of
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
+from hannes_lab.recorded import make_trial
 from hannes_lab.search import Search
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.trials import Trial
 from hannes_sim.effect import strength_of
 
 QUICK = ("fast", "grasp_fast")

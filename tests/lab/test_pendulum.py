@@ -12,10 +12,11 @@ from hannes_description.control_ports import C_POSITION, C_REFERENCE, C_VELOCITY
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.adapter import check_rig
+from hannes_lab.closures import find_moves
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.rig import PlantRig
-from hannes_lab.trials import Closure, Trial, find_moves
+from hannes_lab.trials import Closure, Trial
 from hannes_sim.effect import load_effect
 from hannes_sim.native import CONTROL_SIGNATURE
 from hannes_sim.ports import R_LOAD

@@ -10,8 +10,8 @@ from hannes_lab.features import build_features
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import drifts, notes_of
+from hannes_lab.recorded import make_trial
 from hannes_lab.rig import Nuisance
-from hannes_lab.trials import make_trial
 
 
 def known(model: Model, **entries: dict[str, Any]) -> Model:

@@ -13,8 +13,8 @@ from hannes_lab.fit import fit
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import Prepared, prepare
 from hannes_lab.problem import Problem, build_problem, nuisance_coordinate
+from hannes_lab.recorded import make_trial
 from hannes_lab.rig import Nuisance
-from hannes_lab.trials import make_trial
 
 NOISE = 0.03
 """Of a signal's span, by closure: well above what the rig takes for the least."""

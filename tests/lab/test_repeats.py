@@ -8,8 +8,9 @@ from hannes_description.model import Model
 from hannes_lab.features import build_features, compact_end
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
+from hannes_lab.recorded import make_trial
 from hannes_lab.repeats import FEW, end_of, few
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.trials import Trial
 from hannes_sim.effect import load_effect
 
 

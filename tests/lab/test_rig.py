@@ -15,6 +15,7 @@ from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.units import linear_unit
 from hannes_lab.chance import chance
+from hannes_lab.closures import find_moves
 from hannes_lab.compare import Comparison, compare
 from hannes_lab.diagnose import diagnose, effect_sources
 from hannes_lab.diagnosis import Fall
@@ -31,7 +32,7 @@ from hannes_lab.rig import Nuisance, load_rig, scaled_effect, unit_factor
 from hannes_lab.screen import usable_effects
 from hannes_lab.search import Candidate, Search
 from hannes_lab.spectrum import position_periods
-from hannes_lab.trials import SAME, Closure, Trial, find_moves
+from hannes_lab.trials import SAME, Closure, Trial
 from hannes_sim.effect import EffectParameter, catalogue, load_effect
 from hannes_sim.factory import make_plant
 from hannes_sim.rollout import rollout

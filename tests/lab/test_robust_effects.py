@@ -11,7 +11,7 @@ import yaml
 from hannes_description.model import Model
 from hannes_lab.own_effect import check_own_effects
 from hannes_lab.prepare import prepare
-from hannes_lab.trials import make_trial
+from hannes_lab.recorded import make_trial
 from lab.foreign_bags import Signals, hannes_in_one_line, signals_of_set, write_set
 
 EFFECT = '''

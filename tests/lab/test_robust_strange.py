@@ -27,9 +27,10 @@ from hannes_lab.hand import HandRig, outer_loop
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import load_trials, prepare
 from hannes_lab.problem import nuisance_coordinate
+from hannes_lab.recorded import make_trial
 from hannes_lab.rig import COMES_BACK, Nuisance
 from hannes_lab.search import Candidate, Search, wide_starts
-from hannes_lab.trials import SAME, Closure, Trial, make_trial
+from hannes_lab.trials import SAME, Closure, Trial
 from hannes_lab.wording import _taken_for_its_own
 from hannes_sim.effect import load_effect, strength_of
 from hannes_sim.ports import R_QL

@@ -13,10 +13,11 @@ from hannes_lab.diagnosis import Fall
 from hannes_lab.fit import Fit
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
+from hannes_lab.recorded import make_trial
 from hannes_lab.scan import _distinct, _Place, _strengths, tried_periods
 from hannes_lab.search import FAR, Candidate, Search
 from hannes_lab.spectrum import resolved
-from hannes_lab.trials import Closure, Trial, make_trial
+from hannes_lab.trials import Closure, Trial
 from hannes_sim.effect import load_effect
 
 

@@ -12,10 +12,11 @@ from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
 from hannes_lab.prepare import prepare
 from hannes_lab.problem import nuisance_coordinate
+from hannes_lab.recorded import make_trial
 from hannes_lab.search import Search
 from hannes_lab.settle import _sloped
 from hannes_lab.surrogate import AnchoredRig, of_length, rig_for
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.trials import Trial
 from hannes_sim.effect import strength_of
 from hannes_sim.plant import PlantDiverged
 

@@ -12,19 +12,14 @@ from hannes_description.model import Model
 from hannes_lab.adapter import check_trials
 from hannes_lab.blocks import in_blocks, told_apart
 from hannes_lab.cli_trials import told
+from hannes_lab.closures import find_closures, group_closures
 from hannes_lab.compare import compare
 from hannes_lab.hand import make_controller
 from hannes_lab.phases import PHASES, phase_of
 from hannes_lab.prepare import prepare, without_outliers
-from hannes_lab.trials import (
-    Closure,
-    Trial,
-    find_closures,
-    group_closures,
-    make_trial,
-    reference_on_grid,
-    unique_names,
-)
+from hannes_lab.recorded import make_trial
+from hannes_lab.reference import reference_on_grid
+from hannes_lab.trials import Closure, Trial, unique_names
 from hannes_sim.factory import make_plant
 from hannes_sim.rollout import rollout
 

@@ -12,7 +12,8 @@ from hannes_bags.recording import Channel, Recording
 from hannes_control.reference import half_sine
 from hannes_description.errors import HannesError
 from hannes_lab.prepare import load_trials
-from hannes_lab.trials import Trial, make_trial
+from hannes_lab.recorded import make_trial
+from hannes_lab.trials import Trial
 from hannes_lab.units import in_si
 from lab.foreign_bags import Signals, hannes_in_one_line, scaled, signals_of_set, write_set
 

@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from .trials import RESTS, Closure, Trial, curves_of, in_words
+from .reference import RESTS
+from .trials import Closure, Trial, curves_of, in_words
 
 BLOCK_REST = 0.3
 """s for which the hand rests before a block of closures that is taken as a recording of its own."""

@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from .described import CONTROL_PERIOD
 from .hand import make_controller
-from .trials import Closure, Trial, curves_of, make_trial
+from .recorded import make_trial
+from .trials import Closure, Trial, curves_of
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,9 @@ from hannes_sim.measurement import sample_noise
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from .closures import group_closures
 from .features import stands_for_all
-from .trials import OfAll, Part, Trial, curves_of, group_closures, stem_of
+from .trials import OfAll, Part, Trial, curves_of, stem_of
 
 Array = NDArray[np.float64]
 

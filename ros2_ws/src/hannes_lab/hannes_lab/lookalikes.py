@@ -20,8 +20,8 @@ from scipy.optimize import nnls
 from .diagnose import effect_sources
 from .hide import make_set
 from .prepare import prepare
+from .recorded import make_trial
 from .search import Search
-from .trials import make_trial
 
 Array = NDArray[np.float64]
 

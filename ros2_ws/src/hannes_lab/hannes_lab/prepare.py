@@ -28,22 +28,12 @@ from .lags import with_one_clock
 from .law_check import law_notes
 from .own_law import check_own_code
 from .problem import Problem, build_problem, nuisance_coordinate
+from .recorded import compared, trial_of
 from .report_text import listed
 from .rig import Nuisance, PlantRig, Rig, check_parameters
 from .settle import settle
 from .surrogate import rig_for
-from .trials import (
-    SIGNALS,
-    Closure,
-    NoClosure,
-    OfAll,
-    Trial,
-    compared,
-    curves_of,
-    stem_of,
-    trial_of,
-    unique_names,
-)
+from .trials import SIGNALS, Closure, NoClosure, OfAll, Trial, curves_of, stem_of, unique_names
 from .units import in_si
 
 OUTLIER = 6.0
