@@ -41,7 +41,7 @@ def recording(
         start = 4.0 * wobble
         position += np.where((log > start) & (log < start + 2.0), by, 0.0)
     rng = np.random.default_rng(0)
-    position = position + 1e-3 * rng.standard_normal(log.size)
+    position = position + 2e-3 * rng.standard_normal(log.size)
     channels = {
         "reference_position": Channel(at, np.interp(at, time, reference), "rad", "reference_position"),
         "encoder_position": Channel(log, position, "rad", "encoder_position"),

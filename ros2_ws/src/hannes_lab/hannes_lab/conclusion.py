@@ -111,7 +111,7 @@ class Conclusion:
         far = self._far
         return (
             f"Nothing is missing: with its own parameters fitted, {explained}{other}. {self._fall}"
-            f"{missed_most(self.search.problem, self.falls[-1].signals)}{far and far + nearest}"
+            f"{missed_most(self.search.problem, self.falls[-1].signals, choice.adequate)}{far and far + nearest}"
         )
 
     def _effects(self) -> str:
@@ -160,14 +160,17 @@ class Conclusion:
         return _moved_far(self.best, twins(self.search, self.best, far_off(self.best)))
 
 
-def missed_most(problem: Problem, errors: Sequence[SignalError]) -> str:
-    """Where a model that has an error of its own misses most, and what that hides; empty where it is little."""
+def missed_most(problem: Problem, errors: Sequence[SignalError], adequate: bool = True) -> str:
+    """Where a model that has an error of its own, or is not adequate, misses most; empty where it is little."""
     known = [e for e in errors if math.isfinite(e.ratio)]
     worst = max(known, key=lambda e: e.ratio, default=None)
-    if worst is None or worst.ratio < MUCH or not problem.discrepancy:
+    if worst is None or worst.ratio < MUCH or (adequate and not problem.discrepancy):
         return ""
+    where = f" It is largest in {words(worst.signal)} of '{worst.condition}', {worst.ratio:.1f} times the repeatability"
+    if not problem.discrepancy:
+        return f"{where}: that is more than chance, and may be something that acts there alone."
     return (
-        f" It is largest in {words(worst.signal)} of '{worst.condition}', {worst.ratio:.1f} times the repeatability: "
+        f"{where}: "
         "of another machine the form of the model may be off by as much, and what leaves less is not seen."
     )
 

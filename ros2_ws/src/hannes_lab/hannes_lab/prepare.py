@@ -20,6 +20,7 @@ from .blocks import in_blocks, told_apart
 from .drift import drift_of, drift_together
 from .features import Features, build_features
 from .fit import fit
+from .frozen import without_frozen
 from .gaps import misses_samples
 from .grasp import with_seen_objects
 from .hand import HandRig, other_plant
@@ -42,6 +43,13 @@ OUTLIER = 6.0
 FIRST_APART = 3.0
 """The same from which it is said that the first closure of a recording, which stays, is unlike the others: the machine
 began elsewhere, in its slack, its friction or its grease."""
+
+EXACT = 1e-4
+"""Part of a signal's span within which closures without noise repeat each other: a simulator's in lock-step."""
+
+BEGAN_ELSEWHERE = 2.5e-3
+"""Part of the reference's span by which the position is off it when such a recording begins, from which on the first
+closure, if it is not as the others, is left out: nothing scatters, and a fit would take that for an effect."""
 
 FEW = 5
 """Closures of a condition below which its scatter is no more than guessed, and no test is made (compare.py)."""
@@ -83,7 +91,7 @@ def load_trials(
         read = [compared(read_bag(bag, topics=topics), signals) for bag in bags]
     for bag, recording in zip(bags, in_si(read, scale or {}), strict=True):
         try:
-            trial = trial_of(recording)
+            trial = without_frozen(trial_of(recording))
         except NoClosure as none:
             empty.append(none)
             left_out.append(f"'{bag}': {none}")
@@ -136,7 +144,8 @@ def as_compared(
     typical  closures far from the others are left out already
     """
     if rig is not None:
-        trials = [trial.aligned() for trial in join_trials(check_trials(trials, rig.__name__))]
+        sound = [without_frozen(trial) for trial in check_trials(trials, rig.__name__)]
+        trials = [trial.aligned() for trial in join_trials(sound)]
     if not typical:
         trials = [without_outliers(trial) for trial in trials]
     # Numbers are those of `hannes trials`, which shows what is left of them.
@@ -185,15 +194,23 @@ def _is_simulated(trial: Trial, closure: Closure) -> bool:
 
 
 def without_outliers(trial: Trial) -> Trial:
-    """Leave out closures that are far from the others of their condition (at least five closures needed)."""
+    """Leave out closures that are far from the others of their condition (at least five closures needed).
+
+    Of closures without noise the first one, where the hand was elsewhere when the recording began.
+    """
     kept: list[Closure] = []
     dropped: list[Closure] = []
     said: list[str] = []
     apart: dict[str, float] = {}
+    elsewhere: list[str] = []
     for condition in trial.conditions:
         closures = trial.of(condition)
         if len(closures) < 5:
             kept += list(closures)
+            continue
+        if not _is_simulated(trial, closures[0]) and _began_elsewhere(trial, closures):
+            elsewhere.append(condition)
+            kept += closures[1:]
             continue
         distance = np.zeros(len(closures))
         for time, values in trial.signals.values():
@@ -223,9 +240,38 @@ def without_outliers(trial: Trial) -> Trial:
             for c in dropped
         )
         said.insert(0, note)
+    if elsewhere:
+        of = f" of {listed([repr(c) for c in elsewhere])}" if len(trial.conditions) > 1 else ""
+        said.append(
+            f"the first closure{of} is left out: the others repeat to {100 * EXACT:g} % of each signal's span, and it "
+            "does not: the hand was elsewhere when it began"
+        )
     if not said:
         return trial
     return replace(trial, closures=tuple(sorted(kept, key=lambda c: c.start)), notes=(*trial.notes, *said))
+
+
+def _began_elsewhere(trial: Trial, closures: Sequence[Closure]) -> bool:
+    """Whether closures repeat as a simulator's without noise do, but for the first, which began off the reference.
+
+    A simulated hand that was moved before the recording does; one that was started for it begins at rest at nought.
+    """
+    place = trial.signals.get("encoder_position")
+    if place is None:
+        return False
+    start = max(closures[0].start, 0.0)
+    off = float(np.interp(start, *place)) - float(trial.reference[round(start / trial.period)])
+    if abs(off) <= BEGAN_ELSEWHERE * trial.span:
+        return False
+    first = 0.0
+    for time, values in trial.signals.values():
+        curves = curves_of(closures, time, values)
+        away = np.sqrt(((curves - np.median(curves[1:], axis=0)) ** 2).mean(axis=1))
+        away /= float(np.ptp(curves)) or 1.0
+        if away[1:].max() > EXACT:
+            return False
+        first = max(first, float(away[0]))
+    return first > EXACT
 
 
 def _missing(trial: Trial, closure: Closure) -> str:

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from hannes_description.errors import HannesError
 from hannes_description.model import EffectEntry, Model
 from hannes_sim.effect import EffectType
 from hannes_sim.plant import PlantDiverged
@@ -373,15 +374,22 @@ def build_problem(
             own_error = np.outer(part.share, part.share) * form[part.ix]
             if own_error.any():
                 covariance = covariance + own_error
-                discrepancy.append((part.rows, _factor(own_error)))
-            whitener.append((part.rows, _factor(covariance)))
+                discrepancy.append((part.rows, _factor(own_error, condition)))
+            whitener.append((part.rows, _factor(covariance, condition)))
     covered = np.sort(np.concatenate([rows for rows, _ in whitener]))
     assert np.array_equal(covered, np.arange(features.size)), "the whitener must cover each feature once"
     return Problem(rig, features, tuple(whitener), tuple(deviations), counts or Counts(), tuple(discrepancy))
 
 
-def _factor(covariance: Array) -> Array:
-    return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+def _factor(covariance: Array, condition: str) -> Array:
+    """Cholesky factor; HannesError where a signal is known without any error."""
+    try:
+        return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        raise HannesError(
+            f"A signal of condition '{condition}' neither scatters nor moves, so that nothing can be weighed against "
+            "it: was it measured? Name the signals that were with --signal, or leave the recording out."
+        ) from None
 
 
 def _covariance_of_one(
