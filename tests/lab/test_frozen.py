@@ -51,6 +51,21 @@ def test_closures_in_which_a_sensor_froze_are_left_out_and_said(signal: str, sin
     assert note.startswith(f"{signal} stands still, at ") and f"{6 - left} closure" in note
 
 
+def test_a_coarse_current_at_one_speed_is_not_frozen() -> None:
+    """One code for 80 % of the way in one closure, and two by turns in the others."""
+
+    def coarse(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+        steady = (values > 1.3) & (values < 11.7)
+        return np.where(steady, 0.3 + 0.026 * ((time > EACH) & (np.arange(time.size) % 4 < 2)), values)
+
+    trial = changed(
+        closures(),
+        "motor_voltage",
+        lambda t, v: coarse(t, np.interp(t, *closures().signals["encoder_position"])),
+    )
+    assert without_frozen(trial) is trial
+
+
 def test_a_signal_at_its_limit_or_that_never_moves_is_not_frozen() -> None:
     """The latter is left out as a signal, or refused, by who looks at whole recordings."""
     trial = closures()

@@ -13,10 +13,11 @@ from .trials import Closure, Trial, in_words
 
 Array = NDArray[np.float64]
 
-FROZEN = 0.5
+FROZEN = 0.9
 MORE = 0.4
 """Part of its reference's way for which a signal that is frozen repeats one number at least, and by how much that is
-more than in the closure in which it stands least: at an object, or at the limit of the supply, it may for a while."""
+more than in the closure in which it stands least.  At an object, at the limit of the supply, or with coarse steps at
+one speed, a signal may stand for a while; one that freezes on the way out does for the whole way back."""
 
 FEW = 5
 """Samples of which one number may be repeated for all else."""
