@@ -3,9 +3,9 @@
 VENV ?= $(CURDIR)/.venv
 BIN := $(VENV)/bin
 TESTS ?= tests
-# -n 3: three modules at a time, of which one mostly waits for nodes (tests/conftest.py), so that what a module's tests
-# share is made once; each test of ROS nodes has a domain id of its own
-PYTEST_FLAGS ?= -n 3 --dist loadscope --no-loadscope-reorder
+# -n 2: two modules at a time, so that what a module's tests share is made once; each test of ROS nodes has a domain id
+# of its own
+PYTEST_FLAGS ?= -n 2 --dist loadscope --no-loadscope-reorder
 # one thread of linear algebra per process: the tests and the lab run processes side by side
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1

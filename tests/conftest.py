@@ -34,19 +34,8 @@ DOMAIN_LOCK_PORT = 24300
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The slow tests, and with them their modules, first: at the end no process waits for another one's.
-
-    Modules of tests that wait for nodes are spread evenly among those of tests that compute: one waits while others do.
-    """
-    modules: dict[Path, list[pytest.Item]] = {}
-    for item in sorted(items, key=lambda item: item.get_closest_marker("slow") is None):
-        modules.setdefault(item.path, []).append(item)
-    kinds: dict[bool, list[list[pytest.Item]]] = {True: [], False: []}
-    for own in modules.values():
-        with_nodes = sum("ros_domain_id" in getattr(item, "fixturenames", ()) for item in own)
-        kinds[2 * with_nodes > len(own)].append(own)
-    places = {id(own): (k + 0.5) / len(kind) for kind in kinds.values() for k, own in enumerate(kind)}
-    items[:] = [item for own in sorted(modules.values(), key=lambda own: places[id(own)]) for item in own]
+    """The slow tests, and with them their modules, first: at the end no process waits for another one's."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
 @pytest.fixture(scope="session")

@@ -40,6 +40,4 @@ def test_nothing_says_no_more_than_that_elsewhere(ratios: tuple[float, ...], own
 def test_nothing_that_chance_does_not_bear_out_says_where_it_is_missed_most() -> None:
     """A wheel's speed was missed by 3 times the repeatability in one of eight conditions, and "nothing" by the mean."""
     said = largest(0.9, 3.2, own_error=False, adequate=False)
-    assert said.startswith(
-        " It is largest in motor current of 'air_slow', 3.2 times the repeatability: that is more"
-    )
+    assert said.startswith(" It is largest in motor current of 'air_slow', 3.2 times the repeatability: some")

@@ -168,7 +168,7 @@ def missed_most(problem: Problem, errors: Sequence[SignalError], adequate: bool 
         return ""
     where = f" It is largest in {words(worst.signal)} of '{worst.condition}', {worst.ratio:.1f} times the repeatability"
     if not problem.discrepancy:
-        return f"{where}: that is more than chance, and may be something that acts there alone."
+        return f"{where}: something may act there alone."
     return f"{where}: of another machine the form of the model may be off by as much, and what leaves less is not seen."
 
 
