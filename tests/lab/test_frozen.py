@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -32,10 +33,10 @@ def closures(count: int = 6, noise: float = 0.0) -> Trial:
     )
 
 
-def changed(trial: Trial, signal: str, change: object) -> Trial:
+def changed(trial: Trial, signal: str, change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Trial:
     """The trial with another signal: change(time, values) -> values."""
     time, values = trial.signals[signal]
-    return replace(trial, signals={**trial.signals, signal: (time, change(time, values.copy()))})  # type: ignore[operator]
+    return replace(trial, signals={**trial.signals, signal: (time, change(time, values.copy()))})
 
 
 @pytest.mark.parametrize("signal", ["encoder_position", "motor_voltage"])

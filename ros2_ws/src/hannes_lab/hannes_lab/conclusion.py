@@ -160,7 +160,7 @@ class Conclusion:
         return _moved_far(self.best, twins(self.search, self.best, far_off(self.best)))
 
 
-def missed_most(problem: Problem, errors: Sequence[SignalError], adequate: bool = True) -> str:
+def missed_most(problem: Problem, errors: Sequence[SignalError], adequate: bool) -> str:
     """Where a model that has an error of its own, or is not adequate, misses most; empty where it is little."""
     known = [e for e in errors if math.isfinite(e.ratio)]
     worst = max(known, key=lambda e: e.ratio, default=None)

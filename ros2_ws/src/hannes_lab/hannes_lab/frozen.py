@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
+import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .reference import true_runs
 from .report_text import listed
 from .trials import Closure, Trial, in_words
 
@@ -60,16 +61,16 @@ def _stands_long(values: Array) -> bool:
 
 def _still_way(trial: Trial, closure: Closure, time: Array, values: Array) -> float:
     """Part of the reference's way in a closure over which a signal repeats one number at most."""
+
+    def way(start: float, stop: float) -> float:
+        first, last = math.ceil(max(start, 0.0) / trial.period), math.floor(stop / trial.period)
+        seen = trial.reference[first : last + 1]
+        return float(np.ptp(seen)) if seen.size else 0.0
+
     inside = (time >= closure.start) & (time <= closure.stop)
-    t, v = time[inside], values[inside]
-    ticks = np.arange(trial.reference.size) * trial.period
-    way = float(np.ptp(trial.reference[(ticks >= closure.start) & (ticks <= closure.stop)]))
-    if v.size <= FEW or way <= 0.0:
+    t, whole = time[inside], way(closure.start, closure.stop)
+    if whole <= 0.0:
         return 0.0
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(v) != 0.0) + 1, [v.size]])
-    most = 0.0
-    for first, after in itertools.pairwise(edges):
-        if after - first > FEW:
-            seen = trial.reference[(ticks >= t[first]) & (ticks <= t[after - 1])]
-            most = max(most, float(np.ptp(seen)) if seen.size else 0.0)
-    return most / way
+    # A run of steps without a change is one sample longer than it has steps.
+    runs = [(a, b + 1) for a, b in true_runs(np.diff(values[inside]) == 0.0) if b + 1 - a >= FEW]
+    return max((way(float(t[a]), float(t[b])) for a, b in runs), default=0.0) / whole

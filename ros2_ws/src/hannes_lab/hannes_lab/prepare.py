@@ -44,7 +44,7 @@ FIRST_APART = 3.0
 """The same from which it is said that the first closure of a recording, which stays, is unlike the others: the machine
 began elsewhere, in its slack, its friction or its grease."""
 
-EXACT = 1e-4
+NOISELESS = 1e-4
 """Part of a signal's span within which closures without noise repeat each other: a simulator's in lock-step."""
 
 BEGAN_ELSEWHERE = 2.5e-3
@@ -215,7 +215,7 @@ def without_outliers(trial: Trial) -> Trial:
         distance = np.zeros(len(closures))
         for time, values in trial.signals.values():
             curves = curves_of(closures, time, values)
-            away = np.sqrt(((curves - np.median(curves, axis=0)) ** 2).mean(axis=1))
+            away = _distances(curves, curves)
             distance = np.maximum(
                 distance, away / max(float(np.median(away)), 1e-3 * float(np.ptp(curves)), 1e-12)
             )
@@ -243,12 +243,17 @@ def without_outliers(trial: Trial) -> Trial:
     if elsewhere:
         of = f" of {listed([repr(c) for c in elsewhere])}" if len(trial.conditions) > 1 else ""
         said.append(
-            f"the first closure{of} is left out: the others repeat to {100 * EXACT:g} % of each signal's span, and it "
-            "does not: the hand was elsewhere when it began"
+            f"the first closure{of} is left out: the others repeat to {100 * NOISELESS:g} % of each signal's span, and "
+            "it does not: the hand was elsewhere when it began"
         )
     if not said:
         return trial
     return replace(trial, closures=tuple(sorted(kept, key=lambda c: c.start)), notes=(*trial.notes, *said))
+
+
+def _distances(curves: NDArray[np.float64], among: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Root mean square distance of each curve (n, p) from the median of some of them: (n,)."""
+    return np.asarray(np.sqrt(((curves - np.median(among, axis=0)) ** 2).mean(axis=1)))
 
 
 def _began_elsewhere(trial: Trial, closures: Sequence[Closure]) -> bool:
@@ -266,12 +271,11 @@ def _began_elsewhere(trial: Trial, closures: Sequence[Closure]) -> bool:
     first = 0.0
     for time, values in trial.signals.values():
         curves = curves_of(closures, time, values)
-        away = np.sqrt(((curves - np.median(curves[1:], axis=0)) ** 2).mean(axis=1))
-        away /= float(np.ptp(curves)) or 1.0
-        if away[1:].max() > EXACT:
+        away = _distances(curves, curves[1:]) / (float(np.ptp(curves)) or 1.0)
+        if away[1:].max() > NOISELESS:
             return False
         first = max(first, float(away[0]))
-    return first > EXACT
+    return first > NOISELESS
 
 
 def _missing(trial: Trial, closure: Closure) -> str:
