@@ -50,6 +50,7 @@ def test_what_is_said_is_what_the_lab_takes(
         (['object={"size": "big"}'], "{'size': 'big'} is not understood"),
         (['object={"place": 3}'], "{'place': 3} is not understood"),
         (['object={"size": -1}'], "Object size is -1; it must be a finite number above 0"),
+        (['object={"size": 80}'], "Object size is 80; it is in m, and no hand grasps more than 0.5 m: 0.08"),
         (['object={"shape": "cube"}'], "Object shape 'cube' is unknown; valid are"),
         (["plant=Reduced"], "its `plant` is 'Reduced'; did you mean reduced?"),
         (["sensors=thesis"], "they must be a mapping"),

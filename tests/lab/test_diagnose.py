@@ -289,6 +289,18 @@ def test_effects_that_bend_the_model_and_leave_most_of_the_error_are_no_answer(g
     ):
         assert bent_sentence(choice, falls) == ""
 
+    def worse(search: Search, closures: float, conditions: float) -> str:
+        """Of effects with which what was left out has another error than without."""
+        return bent_sentence(
+            Choice(search, one, limits, True, ()), (*begin[:1], fall(2.0, 1.0), fall(closures, conditions))
+        )
+
+    assert "glove_stiffness would bring the misfit within chance, but foretells" in worse(search, 2.5, 1.3)
+    assert "rises from 2 and 1 to 2.5 and 1.3 times the repeatability" in worse(about, 2.5, 1.3)
+    assert "rises from 1 to 1.3 times" in worse(search, math.nan, 1.3)
+    for closures, conditions in ((2.5, 1.0), (1.5, 1.3), (2.2, 1.1), (math.nan, math.nan)):
+        assert not worse(search, closures, conditions), "not clearly, or not all"
+
     def alone(of: Search, sds: float, error: float) -> str:
         """Of the model without effects, with a viscous friction so many tolerances off."""
         z = one.fit.z.copy()

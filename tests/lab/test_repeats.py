@@ -1,10 +1,12 @@
 """Of closures that repeat each other only as many are simulated as do not yet end as the one before."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from hannes_description.model import Model
+from hannes_lab.clock import REFERENCE_DELAY
 from hannes_lab.features import build_features, compact_end
 from hannes_lab.hand import HandRig
 from hannes_lab.hide import make_set
@@ -12,6 +14,7 @@ from hannes_lab.recorded import make_trial
 from hannes_lab.repeats import FEW, end_of, few
 from hannes_lab.trials import Trial
 from hannes_sim.effect import load_effect
+from hannes_sim.rollout import rollout
 
 
 @pytest.fixture(scope="module")
@@ -68,3 +71,36 @@ def test_a_glove_that_creeps_for_longer_than_that(trial: Trial) -> None:
     ticks, worst, _ = simulated(trial, stiffness=0.004, relaxation=2.0)
     assert ticks == [compact_end(trial), end_of(trial, FEW), trial.reference.size]
     assert worst == 0.0
+
+
+def test_a_longer_simulation_goes_on_from_the_shorter_one(
+    trial: Trial, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the last bit as one from the beginning; and that is made where anything is another."""
+    short, model = trial.reference[: compact_end(trial)], Model.load()
+    made: list[tuple[int, int]] = []
+
+    def counted(plant: Any, law: Any, reference: np.ndarray, *, begin: int = 0, **others: Any) -> Any:
+        made.append((begin, reference.size))
+        return rollout(plant, law, reference, begin=begin, **others)
+
+    monkeypatch.setattr("hannes_lab.rig.rollout", counted)
+    n, size = short.size, trial.reference.size
+    values = {"control.kp": 2.5, "friction.coulomb": 0.01, f"{REFERENCE_DELAY}@{trial.name}": 0.013}
+    whole = HandRig([trial]).run(model, values, trial, trial.reference)
+    rig = HandRig([trial])
+    rig.run(model, values, trial, short)
+    on = rig.run(model, values, trial, trial.reference)
+    assert made == [(0, size), (0, n), (n, size - n)]
+    assert np.array_equal(on.raw, whole.raw) and np.array_equal(on.motor_voltage, whole.motor_voltage)
+
+    for name in values:
+        other = HandRig([trial])
+        other.run(model, {**values, name: 0.9 * values[name]}, trial, short)
+        assert np.array_equal(other.run(model, values, trial, trial.reference).raw, whole.raw), name
+    rig = HandRig([trial])
+    rig.run(model, values, trial, short)
+    assert rig.law_used is not None
+    rig.law_used.reset()  # as who tries the law does
+    assert np.array_equal(rig.run(model, values, trial, trial.reference).raw, whole.raw)
+    assert {begin for begin, _ in made[3:]} == {0}

@@ -14,6 +14,7 @@ from hannes_bringup.cli import main
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.units import linear_unit
+from hannes_lab import trials
 from hannes_lab.chance import chance
 from hannes_lab.closures import find_moves
 from hannes_lab.compare import Comparison, compare
@@ -82,6 +83,12 @@ def test_moves_are_the_stretches_between_standstills() -> None:
     spans = find_moves(reference(2), 1e-3)
     assert len(spans) == 10
     assert [round(b - a, 1) for a, b in spans[:4]] == [0.4, 0.5, 0.6, 0.4]
+
+
+def test_adapters_that_were_written_for_the_first_pages_are_imported() -> None:
+    assert trials.find_moves is find_moves
+    with pytest.raises(ImportError, match="find_no_moves"):
+        exec("from hannes_lab.trials import find_no_moves")
 
 
 def test_moves_after_stands_of_other_lengths_begin_alike() -> None:

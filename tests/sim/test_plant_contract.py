@@ -1,5 +1,6 @@
 """What every plant promises: units, determinism, rest, limits, sign of the motion; run on each plant and variant."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -8,14 +9,17 @@ import numpy as np
 import pytest
 from hannes_control.double_pid import DoublePID
 from hannes_control.reference import half_sine
+from hannes_description.control_ports import C_PERIOD, C_POSITION, C_REFERENCE, C_TIME
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_description.parameters import Parameter
 from hannes_sim.effect import load_effect
 from hannes_sim.factory import make_plant
+from hannes_sim.native import CONTROL_SIGNATURE
 from hannes_sim.objects import RIGID_DYNAMOMETER, SOFT_BALL
 from hannes_sim.plant import Plant, Reading
-from hannes_sim.rollout import VoltagePlayback, rollout
+from hannes_sim.rollout import ROLLOUT_SIGNALS, VoltagePlayback, rollout
+from numba import cfunc
 
 MODELS: dict[str, Callable[[], Model]] = {
     "reduced": lambda: Model.load("nominal"),
@@ -28,6 +32,24 @@ MODELS: dict[str, Callable[[], Model]] = {
 def _variant(**options: str) -> Model:
     model = Model.load("nominal_mujoco")
     return replace(model, variant={**model.variant, **options})
+
+
+@cfunc(CONTROL_SIGNATURE)
+def _swing(x, p, s):  # type: ignore[no-untyped-def]
+    s[0] += x[C_PERIOD] * (x[C_REFERENCE] - x[C_POSITION])
+    return 3.0 * math.sin(9.0 * x[C_TIME]) + s[0]
+
+
+class _Swinging:
+    """A law that swings with the time, with a state."""
+
+    address, period = _swing.address, 1e-3
+
+    def __init__(self) -> None:
+        self.parameters, self.states = np.zeros(1), np.zeros(1)
+
+    def reset(self) -> None:
+        self.states[:] = 0.0
 
 
 @pytest.fixture(params=list(MODELS))
@@ -113,6 +135,18 @@ def test_stepwise_equals_rollout(plant: Plant, model: Model) -> None:
         voltage = law.update(float(wanted), reading.position, reading.current)
         assert voltage == run.motor_voltage[k]
         plant.advance(voltage, steps)
+
+
+def test_a_rollout_that_goes_on_is_the_whole_one(plant: Plant) -> None:
+    """Of a law that knows the time, too: it goes on where it was."""
+    whole = rollout(plant, _Swinging(), np.linspace(0.0, 5.0, 900))
+    law, n = _Swinging(), 333
+    first = rollout(plant, law, whole.reference_position[:n])
+    both = first.followed_by(rollout(plant, law, whole.reference_position[n:], reset=False, begin=n))
+    for name in ("time", *ROLLOUT_SIGNALS):
+        a, b = (run.time if name == "time" else run.signal(name) for run in (both, whole))
+        assert np.array_equal(a, b), name
+    assert np.ptp(whole.motor_voltage) > 4.0
 
 
 def test_a_rollout_without_joints_says_so(plant: Plant, model: Model) -> None:

@@ -40,7 +40,7 @@ def finite(value: Any) -> Any:
 
 def number(value: float | None, digits: int = 4) -> str:
     """A number for a table or a sentence; a dash where there is none."""
-    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
+    return "-" if value is None or not math.isfinite(value) else f"{value + 0.0:.{digits}g}"  # -0 is 0
 
 
 def with_unit(value: float, unit: str, digits: int = 4) -> str:

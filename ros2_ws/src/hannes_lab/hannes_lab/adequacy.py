@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from hannes_description.output import with_unit
 
 from .chance import Chance
 from .scan import period_of
@@ -85,8 +86,8 @@ def implausible(candidate: Candidate) -> str:
     if c is None or off <= IMPLAUSIBLE:
         return ""
     return (
-        f"{c.name} would be {candidate.fit.values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g}, {off:.0f} times "
-        "its tolerance off: if the nominal model is not that of this machine, calibrate it first"
+        f"{c.name} would be {with_unit(candidate.fit.values[c.name], c.unit, 3)} instead of {c.value(0.0):.3g}, "
+        f"{off:.0f} times its tolerance off: if the nominal model is not that of this machine, calibrate it first"
     )
 
 
@@ -101,7 +102,7 @@ def exaggerated(search: Search, candidate: Candidate) -> str:
             strength = abs(candidate.fit.z_of(name) or 0.0)
             if p.vanishing is not None and strength > most:
                 return (
-                    f"{name} would be {candidate.fit.values[name]:.3g} {p.unit}, {strength:.0f} times what is "
+                    f"{name} would be {with_unit(candidate.fit.values[name], p.unit, 3)}, {strength:.0f} times what is "
                     "typical: it stands for something else"
                 )
     return ""
@@ -209,9 +210,9 @@ def led_off(base: Candidate, best: Candidate, by: Sequence[str] = ()) -> str:
     for c, off in best.fit.off:
         if off > PULLED and not c.wide and c.name in known and abs(base.fit.z_of(c.name) or 0.0) < FAR:
             return (
-                f"{' and '.join(by or best.names)} would take {c.name} to {best.fit.values[c.name]:.3g} {c.unit} "
-                f"instead of {c.value(0.0):.3g}, {off:.0f} times its tolerance off, where it is not without: what is "
-                "missing has another form"
+                f"{' and '.join(by or best.names)} would take {c.name} to "
+                f"{with_unit(best.fit.values[c.name], c.unit, 3)} instead of {c.value(0.0):.3g}, "
+                f"{off:.0f} times its tolerance off, where it is not without: what is missing has another form"
             )
     return ""
 

@@ -37,6 +37,7 @@ from .falls import (
     NOMINAL_FITTED,
     WITHOUT_EFFECT,
     before,
+    clearly_less,
     deciding_errors,
     error_falls,
     left_out_errors,
@@ -69,10 +70,6 @@ Array = NDArray[np.float64]
 
 FITTED = "fitted by hannes"
 """Source of the nominal parameters in a model that was fitted, with effects or without."""
-
-FORETOLD = 0.25
-"""Part of the mean square error on closures or on conditions that were left out, that an effect must remove where the
-rest explains all and no model has the machine's form.  A wrong one bends the fit to its own data."""
 
 FEW_CONDITIONS = 3
 """Of so many one that is left out opens most intervals."""
@@ -489,7 +486,7 @@ def _foretells(falls: Sequence[Fall]) -> bool:
     """
     measures = (left_out_errors(falls), [f.held_out_conditions for f in falls])
     known = [errors for errors in measures if np.isfinite(errors[1:]).all()]
-    return not known or any(e[-1] ** 2 <= (1.0 - FORETOLD) * np.nanmin(e[:-1]) ** 2 for e in known)
+    return not known or any(clearly_less(e[-1], float(np.nanmin(e[:-1]))) for e in known)
 
 
 def spans_of(

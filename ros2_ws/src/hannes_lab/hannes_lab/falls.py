@@ -122,6 +122,17 @@ def worth_showing(
     return search.fit_of(names), falls[: keep + 1]
 
 
+FORETOLD = 0.25
+"""Part of the mean square error on closures or on conditions that were left out, by which one is clearly less than
+another: what an effect must remove where the rest explains all and no model has the machine's form.  A wrong one bends
+the fit to its own data."""
+
+
+def clearly_less(error: float, other: float) -> bool:
+    """Whether an error on what was left out is less than another by FORETOLD at least."""
+    return error**2 <= (1.0 - FORETOLD) * other**2
+
+
 def left_out_errors(falls: Sequence[Fall]) -> list[float]:
     """Error on held-out closures of each step; where none was repeated, on held-out conditions (relative_errors)."""
     errors = [fall.held_out for fall in falls]

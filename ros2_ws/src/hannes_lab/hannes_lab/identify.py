@@ -23,6 +23,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from hannes_description.errors import HannesError
 from hannes_description.model import Model
+from hannes_description.output import with_unit
 from hannes_description.parameters import data_path, read_yaml
 from numpy.typing import NDArray
 
@@ -340,7 +341,9 @@ def warnings_of(parameters: Sequence[Identified], free_count: int, data_count: i
                 f"{p.correlation:+.3f}); only a combination of both is identified. Fix one of them."
             )
         if p.at_bound:
-            out.append(f"{p.name} ends on its bound ({p.value:.4g} {p.unit}); the model may lack something.")
+            out.append(
+                f"{p.name} ends on its bound ({with_unit(p.value, p.unit)}); the model may lack something."
+            )
     if free_count >= data_count:
         out.append(
             f"{free_count} free parameters for {data_count} figures: the priors fill in; reaching the figures "

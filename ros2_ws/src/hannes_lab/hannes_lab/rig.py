@@ -230,6 +230,7 @@ class PlantRig:
         self._plants: dict[tuple[str, ...], tuple[Plant, Controller, dict[str, float]]] = {}
         self._signals: OrderedDict[tuple[Any, ...], dict[str, Array]] = OrderedDict()
         self._came_back = True
+        self._latest: _Latest | None = None
         self._model: tuple[Model, tuple[str, ...], dict[str, float]] | None = None
         self.law_used: Controller | None = None
         self.one_mass = False
@@ -447,11 +448,32 @@ class PlantRig:
         reference: Array,
         before: Array | None = None,
     ) -> Rollout:
-        """The rollout from reset, or from where the reference `before` leads."""
+        """The rollout from reset, or from where the reference `before` leads.
+
+        Where the latest one was the beginning of the same, it goes on from there.
+        """
         plant, controller, base = self._plant(model, trial)
         self.law_used = controller
         wanted = self._wanted(model, values, trial)
         reference = moved(reference, wanted.pop(REFERENCE_DELAY, 0.0), 0.0, trial)
+        asked = (wanted, controller.parameters.tobytes(), b"" if before is None else before.tobytes())
+        begun, self._latest = self._latest, None
+        if begun is None or not begun.begins(plant, controller, asked, reference):
+            self._set(plant, base, wanted)
+            if before is not None:
+                rollout(plant, controller, before, joints=False)
+            done = rollout(plant, controller, reference, reset=before is None, joints=False)
+        else:
+            n = begun.run.time.size
+            rest = rollout(plant, controller, reference[n:], reset=False, begin=n, joints=False)
+            done = begun.run.followed_by(rest)
+        self._latest = _Latest(plant, asked, done, controller.states.copy(), plant.reading.copy())
+        self._came_back = came_back(done, trial, self.comes_back(model, trial))
+        return done
+
+    @staticmethod
+    def _set(plant: Plant, base: dict[str, float], wanted: Mapping[str, float]) -> None:
+        """Give a plant the wanted parameters, and those of `base`, its own, that are not among them."""
         for name in set(base) - set(wanted):
             plant.set(name, base[name])
         for name, value in wanted.items():
@@ -463,11 +485,6 @@ class PlantRig:
                     )
                 base[name] = plant.get(name)
             plant.set(name, value)
-        if before is not None:
-            rollout(plant, controller, before, joints=False)
-        done = rollout(plant, controller, reference, reset=before is None, joints=False)
-        self._came_back = came_back(done, trial, self.comes_back(model, trial))
-        return done
 
     def _of(self, model: Model) -> tuple[tuple[str, ...], dict[str, float]]:
         """What tells its plant from another, and the values of its effects; kept while the model is the same."""
@@ -500,6 +517,35 @@ class PlantRig:
             _check_law(law, trial.period, f"The control law '{model.controller}'")
             self._plants[key] = (plant, law, {})
         return self._plants[key]
+
+
+@dataclass(frozen=True)
+class _Latest:
+    """The latest rollout, and what a longer one must share with it to go on from where it ended.
+
+    asked           parameters of the plant, those of the law, and the reference before
+    states, reading of law and plant at its end
+    """
+
+    plant: Plant
+    asked: tuple[Mapping[str, float], bytes, bytes]
+    run: Rollout
+    states: Array
+    reading: Array
+
+    def begins(
+        self, plant: Plant, law: Controller, asked: tuple[Mapping[str, float], bytes, bytes], reference: Array
+    ) -> bool:
+        """Whether it is the beginning of what is asked, and nothing moved plant or law since."""
+        n = self.run.reference_position.size
+        return (
+            plant is self.plant
+            and asked == self.asked
+            and n < reference.size
+            and np.array_equal(self.run.reference_position, reference[:n])
+            and np.array_equal(law.states, self.states)
+            and np.array_equal(plant.reading, self.reading)
+        )
 
 
 @lru_cache(maxsize=512)

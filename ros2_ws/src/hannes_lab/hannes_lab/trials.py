@@ -312,3 +312,12 @@ def _renamed(condition: str, old: str, new: str) -> str:
     """The name of a condition of a trial of a new name: it changes with it where it is the trial's, or begins so."""
     named_after = condition == old or condition.startswith(f"{old}.")
     return new + condition.removeprefix(old) if named_after else condition
+
+
+def __getattr__(name: str) -> Any:
+    """`find_moves`, for the adapters that were written when it stood here."""
+    if name == "find_moves":
+        from .closures import find_moves
+
+        return find_moves
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

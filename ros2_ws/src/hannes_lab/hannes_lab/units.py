@@ -15,6 +15,7 @@ import numpy as np
 from hannes_bags.recording import LOOKS_LIKE, Recording
 from hannes_description.errors import HannesError
 from hannes_description.joints import RAD_PER_COUNT
+from hannes_description.output import with_unit
 from hannes_description.signals import SIGNALS
 from numpy.typing import NDArray
 
@@ -184,7 +185,7 @@ def _drop_dead(one: _One, scale: Mapping[str, float]) -> None:
         values = one.samples[name][1]
         if values.size < FEW or np.ptp(values) > 0.0:
             continue
-        told = f"{name} is {values[0]:.4g} {SIGNALS[name].unit} throughout, though the reference moves"
+        told = f"{name} is {with_unit(values[0], SIGNALS[name].unit)} throughout, though the reference moves"
         if set(one.samples) == {REFERENCE, name}:
             raise HannesError(
                 f"{one.where}: {told}: it was not measured, and nothing else can be compared. Record it again, with an "
@@ -204,7 +205,7 @@ def _drop_dead_force(ones: Sequence[_One], scale: Mapping[str, float]) -> None:
     for one in with_it:
         value = float(one.samples[FORCE][1][0])
         one.notes.append(
-            f"{FORCE} is {value:.4g} {SIGNALS[FORCE].unit} throughout in all recordings: it was not measured, or "
+            f"{FORCE} is {with_unit(value, SIGNALS[FORCE].unit)} throughout in all recordings: it was not measured, or "
             f"nothing was pressed, and is left out; say --scale {FORCE}=1 to take it as it is"
         )
         del one.samples[FORCE]

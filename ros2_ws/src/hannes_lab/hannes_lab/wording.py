@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from hannes_description.output import number
+from hannes_description.output import number, with_unit
 
 from .adequacy import disbelieved, unshown, waves_of
 from .chance import Chance
@@ -17,7 +17,7 @@ from .clock import REFERENCE_DELAY, REFERENCE_DELAY_SD
 from .diagnosis import Fall, FoundEffect, Rank
 from .directions import ways
 from .experiments import VISIBLE, Experiment
-from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, deciding_errors, left_out_errors
+from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, clearly_less, deciding_errors, left_out_errors
 from .fit import Fit, fit
 from .intervals import grain_widens
 from .problem import Coordinate, Problem, nuisance_coordinate
@@ -74,11 +74,21 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
     Where a set of effects takes a machine far outside its tolerances as well, and the error on what took no part in the
     fit does not fall to half of what it is above the repeatability, the effects only help to bend the model.  Where the
     model alone does so, and leaves more than LEFT, something of the same form may be missing: nobody can tell.  Nor
-    does a wave of which the way shows too little, see unshown.
+    does a wave of which the way shows too little, see unshown, nor do effects with which all that was left out is
+    foretold clearly worse.
     """
     best, before, after = choice.best, falls[NOMINAL_FITTED], falls[-1]
     if why := unshown(choice.search, best, after.held_out):
         return why
+    pairs = ((before.held_out, after.held_out), (before.held_out_conditions, after.held_out_conditions))
+    known = [(a, b) for a, b in pairs if np.isfinite([a, b]).all()]
+    if best.names and known and all(clearly_less(a, b) for a, b in known):
+        return (
+            f"{' and '.join(best.names)} would bring the misfit within chance, but "
+            f"{'foretells' if len(best.names) == 1 else 'foretell'} what took no part in the fit clearly worse: the "
+            f"error there rises from {' and '.join(number(a) for a, _ in known)} to "
+            f"{' and '.join(number(b) for _, b in known)} times the repeatability"
+        )
     if not (best.far_off and choice.search.problem.discrepancy):
         return ""
     if not best.names:
@@ -88,8 +98,6 @@ def bent_sentence(choice: Choice, falls: Sequence[Fall]) -> str:
             if far and after.held_out > LEFT
             else ""
         )
-    pairs = ((before.held_out, after.held_out), (before.held_out_conditions, after.held_out_conditions))
-    known = [(a, b) for a, b in pairs if np.isfinite([a, b]).all()]
     if not known or any(halved(a, b) for a, b in known):
         return ""
     return (
@@ -433,7 +441,7 @@ def _far_above(search: Search, best: Candidate) -> str:
 def _said_far(found: Fit, far: Sequence[Coordinate]) -> str:
     values, off = found.values, {c.name: z for c, z in found.off}
     return ", ".join(
-        f"{c.name} {values[c.name]:.3g} {c.unit} instead of {c.value(0.0):.3g} ({off[c.name]:.0f} tolerances)"
+        f"{c.name} {with_unit(values[c.name], c.unit, 3)} instead of {c.value(0.0):.3g} ({off[c.name]:.0f} tolerances)"
         for c in far
     )
 
@@ -518,8 +526,8 @@ def _inseparable(search: Search, experiments: Sequence[Experiment]) -> list[str]
 def _ends(search: Search, best: Candidate, effects: Sequence[FoundEffect]) -> list[str]:
     """The parameters that the end of their range holds, and the effects' of which the 95 % interval is cut there."""
     out = [
-        f"{c.name} lies at the end of its range ({c.lower:g} to {c.upper:g} {c.unit}): the true value may lie beyond "
-        "it, or it is another effect of a similar form"
+        f"{c.name} lies at the end of its range ({c.lower:g} to {with_unit(c.upper, c.unit, 6)}): the true value may "
+        "lie beyond it, or it is another effect of a similar form"
         for c in best.fit.at_end
     ]
     known = {c.name: c for c in best.fit.coordinates}
@@ -529,8 +537,8 @@ def _ends(search: Search, best: Candidate, effects: Sequence[FoundEffect]) -> li
             c = known[f"{effect.name}.{name}"]
             if p.identified and any(c.at_end(c.z(end)) for end in (p.low, p.high)):
                 out.append(
-                    f"the 95 % interval of {c.name} ({p.low:.3g} .. {p.high:.3g} {c.unit}) is cut at the end of its "
-                    f"range ({c.lower:g} to {c.upper:g}): the true value may lie beyond it{wider}"
+                    f"the 95 % interval of {c.name} ({number(p.low, 3)} .. {with_unit(p.high, c.unit, 3)}) is cut at "
+                    f"the end of its range ({c.lower:g} to {c.upper:g}): the true value may lie beyond it{wider}"
                 )
     return out + held_notes(best.fit)
 
@@ -544,7 +552,7 @@ def moved_notes(found: Fit) -> list[str]:
 def held_notes(found: Fit) -> list[str]:
     """The parameters of the model's file that the end of their range holds."""
     return [
-        f"the fit holds {c.name} at {c.value(float(z)):.4g} {c.unit}, {_held_at(found, c, float(z))}?"
+        f"the fit holds {c.name} at {with_unit(c.value(float(z)), c.unit)}, {_held_at(found, c, float(z))}?"
         for c, z in zip(found.coordinates, found.z, strict=True)
         if c.nuisance and c.name in found.model.names and any(abs(z - end) < HELD for end in c.bounds)
     ]
@@ -577,7 +585,7 @@ def _undescribed(best: Candidate) -> list[str]:
         name, _, place = c.name.partition("@")
         if c.wide:
             shown = value if abs(value) > NOUGHT else 0.0
-            fitted.setdefault(place, []).append(f"{name} {shown:.3g} {c.unit}".rstrip())
+            fitted.setdefault(place, []).append(f"{name} {with_unit(shown, c.unit, 3)}")
     whole = fitted.pop("")
     return [f"the recordings do not tell these, so they were fitted: {', '.join(whole)}"] * bool(whole) + [
         f"{place}: fitted too, as the recording does not tell them exactly: {', '.join(own)}"

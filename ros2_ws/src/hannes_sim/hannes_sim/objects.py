@@ -13,6 +13,9 @@ from hannes_description.errors import HannesError
 SHAPES = ("capsule", "sphere", "box", "prism", "pentagon")
 """prism and pentagon are regular prisms of six and five sides; all but the sphere lie across the fingers."""
 
+LARGEST = 0.5
+"""m; more than any hand opens."""
+
 
 @dataclass(frozen=True)
 class GraspObject:
@@ -46,6 +49,11 @@ class GraspObject:
                 raise HannesError(
                     f"Object {name} is {value}; it must be a finite number above {max(low, 0.0)}."
                 )
+        if self.size > LARGEST:
+            raise HannesError(
+                f"Object size is {self.size:g}; it is in m, and no hand grasps more than {LARGEST:g} m: "
+                f"{self.size / 1000.0:g}, if these are mm."
+            )
         if len(self.place) != 3 or not all(math.isfinite(c) for c in self.place):
             raise HannesError(f"Object place is {self.place}; it must be three finite numbers in m.")
         if self.tolerance is not None and not (math.isfinite(self.tolerance) and self.tolerance >= 0.0):

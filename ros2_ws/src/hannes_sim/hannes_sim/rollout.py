@@ -57,7 +57,7 @@ _BY_PLANT = 2
 
 @njit(cache=True, nogil=True)
 def _closed_loop(  # type: ignore[no-untyped-def]
-    advance, handle, reading, control, cx, cp, cs, reference, period, substeps, out, voltages, raised
+    advance, handle, reading, control, cx, cp, cs, reference, begin, period, substeps, out, voltages, raised
 ):
     cx_at, cp_at, cs_at, handle_at = cx.ctypes.data, cp.ctypes.data, cs.ctypes.data, handle.ctypes.data
     n = reference.shape[0]
@@ -67,7 +67,7 @@ def _closed_loop(  # type: ignore[no-untyped-def]
         cx[C_VELOCITY] = reading[R_VELOCITY]
         cx[C_CURRENT] = reading[R_CURRENT]
         cx[C_PERIOD] = period
-        cx[C_TIME] = k * period
+        cx[C_TIME] = (begin + k) * period
         voltage = call_control(control, cx_at, cp_at, cs_at)
         if raised[0] != 0:
             return k
@@ -152,6 +152,15 @@ class Rollout:
             raise HannesError("This rollout was made without the finger joints: make it with joints=True.")
         return self.raw[:, first : first + N_JOINTS]
 
+    def followed_by(self, other: Rollout) -> Rollout:
+        """This one and then another, which went on from where it ended."""
+        return Rollout(
+            np.concatenate([self.time, other.time]),
+            np.concatenate([self.reference_position, other.reference_position]),
+            np.concatenate([self.motor_voltage, other.motor_voltage]),
+            np.concatenate([self.raw, other.raw]),
+        )
+
     def signal(self, name: str) -> Array:
         """A signal by its canonical name."""
         if name not in ROLLOUT_SIGNALS:
@@ -193,12 +202,19 @@ def step_of(period: float) -> float:
 
 
 def rollout(
-    plant: Plant, controller: Controller, reference: Array, *, reset: bool = True, joints: bool = True
+    plant: Plant,
+    controller: Controller,
+    reference: Array,
+    *,
+    reset: bool = True,
+    begin: int = 0,
+    joints: bool = True,
 ) -> Rollout:
     """Run the closed loop over a reference (n,) of one value per control period.
 
     Each tick: read, control, log, advance (the order of the lock-step node graph, which gives the same trajectory).
-    reset=False goes on from the present state; joints=False leaves the finger joints out of the log, which is faster.
+    reset=False goes on from the present state, `begin` ticks after what a law takes for its beginning; joints=False
+    leaves the finger joints out of the log, which is faster.
     Raises PlantDiverged where the simulation does; HannesError for a reference that is not finite, and where the
     law or an effect raises an exception.
     """
@@ -225,6 +241,7 @@ def rollout(
             controller.parameters,
             controller.states,
             reference,
+            begin,
             controller.period,
             substeps,
             out,
@@ -232,11 +249,11 @@ def rollout(
             raised.flag,
         )
     if raised.said:
-        raise _failed(plant, raised, done * controller.period)
+        raise _failed(plant, raised, (begin + done) * controller.period)
     plant.check()
     if done < n:
         raise HannesError(
-            f"The controller returned a non-finite voltage at t = {done * controller.period:.3f} s; "
+            f"The controller returned a non-finite voltage at t = {(begin + done) * controller.period:.3f} s; "
             "check its gains."
         )
     if joints:

@@ -69,6 +69,12 @@
     return v.toFixed(places).replace("-", "−");
   }
 
+  /* A label of the vertical axis: as short as its margin is narrow. */
+  function tick(x) {
+    var short = +x.toPrecision(6), small = short !== 0 && Math.abs(short) < 1e-3;
+    return (small ? short.toExponential() : String(short)).replace(/-/g, "−");
+  }
+
   function axis(extra) {
     return Object.assign({
       stroke: colour("soft"), grid: { stroke: colour("grid"), width: 1 }, ticks: { show: false },
@@ -124,7 +130,7 @@
           axes: [axis({ size: xaxis ? 28 : 0, show: xaxis, values: function (u, v) {
                    return v.map(function (x, k) { return String(+x.toFixed(6)) + (k === v.length - 1 ? " s" : ""); }); } }),
                  axis({ size: 52, space: xaxis ? 22 : 32, values: function (u, v) {
-                   return v.map(function (x) { return String(+x.toPrecision(6)).replace("-", "−"); }); } })],
+                   return v.map(tick); } })],
           hooks: {
             drawClear: [shade(runs, names)],
             setCursor: [function (u) { if (u === plots[0]) tell(u.cursor.idx); }],
