@@ -81,6 +81,12 @@ def doubled(signals: Signals) -> Signals:
     return {**signals, "motor_current": (t[again], v[again])}
 
 
+def lossy(signals: Signals) -> Signals:
+    t, v = signals["motor_current"]
+    heard = np.random.default_rng(3).random(t.size) > 0.3
+    return {**signals, "motor_current": (t[heard], v[heard])}
+
+
 def pushed(signals: Signals) -> Signals:
     t, v = signals["encoder_position"]
     v[(t > 8.8) & (t < 10.0)] += 3.0
@@ -119,6 +125,7 @@ def an_hour_later(signals: Signals) -> Signals:
             doubled,
             "Messages that repeat the one before, its stamp too, were left out: 7 on /hannes/motor/current",
         ),
+        (lossy, "messages seem to be lost: 30 % of motor_current"),
         (pushed, "1 closure(s) far from the others are left out"),
         (without("motor_current"), "no current is recorded"),
         (without("encoder_position"), "no encoder position is recorded"),

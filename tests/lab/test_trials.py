@@ -14,6 +14,7 @@ from hannes_lab.blocks import in_blocks, told_apart
 from hannes_lab.cli_trials import told
 from hannes_lab.closures import find_closures, group_closures
 from hannes_lab.compare import compare
+from hannes_lab.gaps import lost_part
 from hannes_lab.hand import make_controller
 from hannes_lab.phases import PHASES, phase_of
 from hannes_lab.prepare import prepare, without_outliers
@@ -495,3 +496,17 @@ def test_a_reference_that_stands_is_at_rest_only_where_others_are_lowest_too() -
         for closure, name in zip(closures, expected, strict=True):
             found = phase_of(trial, closure, at[at < closure.stop - closure.start - 0.05], None)
             assert set(found) == {PHASES.index(name)}
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.03, 0.15, 0.4])
+def test_lost_messages_are_counted(lost: float) -> None:
+    """By chance; not those of a logger that asks at a rate of its own, nor irregular stamps."""
+    rng = np.random.default_rng(2)
+    time = np.arange(3000) / 100.0 + rng.normal(0.0, 2e-4, 3000)
+    heard = rng.random(time.size) >= lost
+    part = lost_part(time[heard])
+    assert part == (0.0 if lost < 0.1 else pytest.approx(lost, abs=0.03))
+    assert lost_part(np.concatenate([time[heard], time[heard] + 90.0])) == pytest.approx(part, abs=0.01)
+    asked = np.unique(np.floor(np.arange(0.0, 30.0, 1.0 / 66.7) * 100.0) / 100.0)
+    assert lost_part(asked) == 0.0 == lost_part(np.sort(rng.uniform(0.0, 30.0, 3000)))
+    assert lost_part(time[:2]) == 0.0 == lost_part(time[:0])

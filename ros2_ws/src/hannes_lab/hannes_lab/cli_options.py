@@ -49,7 +49,8 @@ LeaveOut = Annotated[
     list[str] | None,
     typer.Option(
         "--leave-out",
-        help="Closures that do not count, as CONDITION=NUMBER[,NUMBER...], from 1 on, as `hannes trials` shows them.",
+        help="Closures that do not count, as CONDITION=NUMBER[,NUMBER...], from 1 on, of those that `hannes trials "
+        "--json` lists with their starts.",
     ),
 ]
 RigFile = Annotated[

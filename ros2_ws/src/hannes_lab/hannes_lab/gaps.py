@@ -27,6 +27,16 @@ FOLLOWED = 0.25
 MOST_TOLD = 4
 """Gaps that are told one by one."""
 
+LOST = 0.08
+BY_CHANCE = 0.3
+"""Part of a signal's messages from which on it is said that they are lost, and part of the steps of three and more that
+losses by chance make of it: a logger that asks at a rate of its own leaves out one at a time, in turn."""
+
+WHOLE = 0.2
+IN_STEP = 0.95
+"""Part of its usual step by which a step may miss a whole number of them, and part of the steps that must be such: else
+a signal is logged irregularly, and nothing is lost."""
+
 
 def misses_samples(time: Array, start: float, stop: float) -> bool:
     """True where a signal has no sample for longer than it usually has, though not so long as to be a gap."""
@@ -109,3 +119,32 @@ def said_of_gaps(
             more = f" and in {len(gaps) - MOST_TOLD} more places" if len(gaps) > MOST_TOLD else ""
             notes.append(f"{begin} {told}{more}: {end}")
     return notes
+
+
+def lost_part(time: Array) -> float:
+    """Part of a signal's messages that are lost: its steps are whole numbers of the usual one, some two or more.
+
+    0 where it is logged irregularly, where next to nothing is lost, and for what is a gap.
+    """
+    steps = np.diff(time)
+    steps = steps[steps <= _longest_step(time)] if steps.size > 2 else steps[:0]
+    if not steps.size:
+        return 0.0
+    taken = steps / float(np.quantile(steps, 0.2, method="nearest"))
+    whole = np.maximum(np.round(taken), 1.0)
+    if np.mean(np.abs(taken - whole) <= WHOLE) < IN_STEP:
+        return 0.0
+    lost = float(np.sum(whole - 1.0))
+    part = lost / (lost + steps.size)
+    in_turn = np.mean(whole >= 3.0) < BY_CHANCE * part**2
+    return 0.0 if part < LOST or in_turn else part
+
+
+def said_of_losses(times: Mapping[str, Array]) -> list[str]:
+    """A note on the signals of which messages are lost."""
+    parts = {name: lost_part(time) for name, time in times.items()}
+    told = ", ".join(f"{100.0 * part:.0f} % of {name}" for name, part in parts.items() if part)
+    return [
+        f"messages seem to be lost: {told} (steps of two and more of the usual one); what is between is interpolated: "
+        "record on the machine that publishes them, or reliably"
+    ] * bool(told)

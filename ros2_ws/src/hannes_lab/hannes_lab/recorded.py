@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .closures import SAME_KIND, find_closures, group_closures
 from .described import control_period, hold_rate
-from .gaps import has_gap, said_of_gaps, split_gaps, widest_gap
+from .gaps import has_gap, said_of_gaps, said_of_losses, split_gaps, widest_gap
 from .reference import RESTS, reference_on_grid, rest_value
 from .trials import EARLY, SIGNALS, NoClosure, Trial, in_words, left_out, stem_of
 from .units import in_si
@@ -99,6 +99,7 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     inside = [(a, min(b, end)) for a, b in spans if a >= begin - EARLY and min(b, end) > a]
     silent, alone = split_gaps(logged[0], samples)
     notes += said_of_gaps(silent, alone, logged, samples.get("encoder_position"))
+    notes += said_of_losses({s: time for s, (time, _) in samples.items()})
     # A closure that seems to begin where the silence ends began in it.
     whole = [
         span
