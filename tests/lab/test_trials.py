@@ -220,6 +220,16 @@ def without_samples(whole: Recording, begin: float, end: float, *names: str) -> 
             4,
             ["reference_position has no sample from 7.90 to 16.10 s: it is guessed there"],
         ),
+        (
+            8.9,
+            10.0,
+            SIGNALS[:1],
+            5,
+            [
+                "reference_position has no sample from 8.90 to 10.00 s: it is guessed there",
+                "1 closure in which samples are missing is left out",
+            ],
+        ),
         (8.02, 8.04, SIGNALS, 6, []),
     ],
 )
@@ -230,6 +240,18 @@ def test_gaps_are_said(begin: float, end: float, names: tuple[str, ...], left: i
     assert len(trial.closures) == left and len(trial.conditions) == 1
     assert len(trial.notes) == len(said)
     assert all(note.startswith(text) for note, text in zip(trial.notes, said, strict=True)), trial.notes
+
+
+def test_a_reference_that_is_logged_only_where_it_changes_is_taken_as_it_is() -> None:
+    """Every closure has a stretch without a message of it: none is left out for that."""
+    steps = np.tile(np.repeat([0.0, 6.0, 12.0, 6.0], 1000), 5)
+    whole = recording(steps, 1000.0)
+    channel = whole["reference_position"]
+    jumps = np.flatnonzero(np.diff(channel.values, prepend=-1.0, append=-1.0)[:-1])
+    told = Channel(channel.time[jumps], channel.values[jumps], "rad", "reference_position")
+    trial = make_trial(replace(whole, channels={**whole.channels, "reference_position": told}))
+    assert len(trial.closures) >= 4
+    assert not any("samples are missing" in note for note in trial.notes), trial.notes
 
 
 def test_a_closure_unlike_the_others_in_which_samples_are_missing_is_said_to_be_that() -> None:

@@ -24,6 +24,10 @@ leaves."""
 FOLLOWED = 0.25
 """Part of the reference's span that an encoder goes over in a gap of it where there was something to follow."""
 
+MOST_GUESSED = 0.5
+"""Part of the closures up to which those whose reference is guessed are left out: a reference that is logged only when
+it jumps is guessed in all of them."""
+
 MOST_TOLD = 4
 """Gaps that are told one by one."""
 
@@ -89,13 +93,11 @@ def split_gaps(time: Array, samples: Mapping[str, tuple[Array, Array]]) -> tuple
     return silent, alone
 
 
-def said_of_gaps(
-    silent: Sequence[Span],
-    alone: Sequence[Span],
-    reference: tuple[Array, Array],
-    encoder: tuple[Array, Array] | None,
-) -> list[str]:
-    """Notes on gaps of the reference; one that stands, and the hand with it, may be logged only when it changes."""
+def guessed(
+    gaps: Sequence[Span], reference: tuple[Array, Array], encoder: tuple[Array, Array] | None
+) -> list[Span]:
+    """The gaps of the reference alone in which it moves; one that stands, and the hand with it, may be logged only when
+    it changes."""
     time, values = reference
     span = float(np.ptp(values))
 
@@ -105,14 +107,20 @@ def said_of_gaps(
         done = encoder[1][(encoder[0] > a) & (encoder[0] < b)] if encoder is not None else np.zeros(0)
         return bool(done.size) and float(np.ptp(done)) > FOLLOWED * span
 
+    return [gap for gap in gaps if moves(*gap)]
+
+
+def within(gaps: Sequence[Span], start: float, stop: float) -> list[Span]:
+    """What lies of gaps within a stretch."""
+    return [(max(a, start), min(b, stop)) for a, b in gaps if a < stop and start < b]
+
+
+def said_of_gaps(silent: Sequence[Span], guesses: Sequence[Span]) -> list[str]:
+    """Notes on gaps of the reference: those in which every signal has one too, and those in which it is guessed."""
     notes = []
     for gaps, begin, end in (
         (silent, "nothing was recorded from", "what was there is not known"),
-        (
-            [gap for gap in alone if moves(*gap)],
-            "reference_position has no sample from",
-            "it is guessed there",
-        ),
+        (guesses, "reference_position has no sample from", "it is guessed there"),
     ):
         if gaps:
             told = ", ".join(f"{a:.2f} to {b:.2f} s" for a, b in gaps[:MOST_TOLD])

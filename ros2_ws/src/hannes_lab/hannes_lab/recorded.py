@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from .closures import SAME_KIND, find_closures, group_closures
 from .described import control_period, hold_rate
-from .gaps import has_gap, said_of_gaps, said_of_losses, split_gaps, widest_gap
+from .gaps import (
+    MOST_GUESSED,
+    guessed,
+    has_gap,
+    said_of_gaps,
+    said_of_losses,
+    split_gaps,
+    widest_gap,
+    within,
+)
 from .reference import RESTS, reference_on_grid, rest_value
 from .trials import EARLY, SIGNALS, NoClosure, Trial, in_words, left_out, stem_of
 from .units import in_si
@@ -98,12 +107,17 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     spans = find_closures(reference, period)
     inside = [(a, min(b, end)) for a, b in spans if a >= begin - EARLY and min(b, end) > a]
     silent, alone = split_gaps(logged[0], samples)
-    notes += said_of_gaps(silent, alone, logged, samples.get("encoder_position"))
+    encoder = samples.get("encoder_position")
+    guesses = guessed(alone, logged, encoder)
+    notes += said_of_gaps(silent, guesses)
     notes += said_of_losses({s: time for s, (time, _) in samples.items()})
+    known = [span for span in inside if not guessed(within(guesses, *span), logged, encoder)]
+    if len(inside) - len(known) > MOST_GUESSED * len(inside):
+        known = inside
     # A closure that seems to begin where the silence ends began in it.
     whole = [
         span
-        for span in inside
+        for span in known
         if not any(has_gap(time, *span) for time, _ in samples.values())
         and not any(a < span[0] <= b for a, b in silent)
     ]
