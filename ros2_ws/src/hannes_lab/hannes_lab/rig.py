@@ -467,7 +467,8 @@ class PlantRig:
             n = begun.run.time.size
             rest = rollout(plant, controller, reference[n:], reset=False, begin=n, joints=False)
             done = begun.run.followed_by(rest)
-        self._latest = _Latest(plant, asked, done, controller.states.copy(), plant.reading.copy())
+        if reference.size < trial.reference.size:
+            self._latest = _Latest(plant, asked, done, controller.states.copy(), plant.reading.copy())
         self._came_back = came_back(done, trial, self.comes_back(model, trial))
         return done
 
