@@ -104,3 +104,27 @@ def test_a_longer_simulation_goes_on_from_the_shorter_one(
     rig.law_used.reset()  # as who tries the law does
     assert np.array_equal(rig.run(model, values, trial, trial.reference).raw, whole.raw)
     assert {begin for begin, _ in made[3:]} == {0}
+
+
+def test_an_adapter_may_work_in_the_arrays_of_a_simulation(trial: Trial) -> None:
+    """What it changes there is not changed once more where a longer one goes on."""
+
+    class InPlace(HandRig):
+        def run(self, model, values, trial, reference):  # type: ignore[no-untyped-def]
+            done = super().run(model, values, trial, reference)
+            done.encoder_position[:] -= 0.01
+            done.reference_position[:] += 0.5
+            return done
+
+        def logged(self, run, trial, window=None):  # type: ignore[no-untyped-def]
+            out = super().logged(run, trial, window)
+            out["encoder_position"] += 0.02
+            return out
+
+    model, references = Model.load(), [trial.reference[:n].copy() for n in (5000, 9000, trial.reference.size)]
+    whole = InPlace([trial]).observed(model, {}, trial, trial.reference.copy())
+    rig = InPlace([trial])
+    for reference in references:
+        signals = rig.observed(model, {}, trial, reference)
+        n = signals["encoder_position"].size
+        assert np.array_equal(signals["encoder_position"], whole["encoder_position"][:n])

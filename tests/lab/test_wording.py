@@ -17,7 +17,7 @@ from hannes_lab.problem import nuisance_coordinate
 from hannes_lab.rig import Nuisance
 from hannes_lab.search import Candidate
 from hannes_lab.trials import Closure, Trial
-from hannes_lab.wording import _one_way, notes, phase_moves, unmoved, worse_fitted
+from hannes_lab.wording import _identifiability, _one_way, notes, phase_moves, unmoved, worse_fitted
 
 
 def test_a_condition_that_is_alone_in_its_direction_is_told() -> None:
@@ -140,3 +140,29 @@ def test_an_answer_has_these_notes() -> None:
 
     assert told("unknown", True) == [True, True]
     assert told("unknown", False) == told("nothing", True) == [False, True]
+
+
+def test_what_moves_the_data_alike_is_told_once() -> None:
+    """A factor that all forces share is one sentence, not one for each pair; of tolerances alone nothing is said."""
+    rng = np.random.default_rng(4)
+    force, other, third = rng.standard_normal((3, 200))
+
+    def told(columns: dict[str, np.ndarray], *known: str) -> list[str]:
+        coordinates = tuple(
+            replace(nuisance_coordinate(Nuisance(n, 1.0, 0.1, True, 0.0)), prior=n in known) for n in columns
+        )
+        jacobian = 1e3 * np.column_stack([c + 1e-3 * rng.standard_normal(200) for c in columns.values()])
+        z = np.zeros(len(columns))
+        return _identifiability(
+            Candidate((), Fit(Model.load(), coordinates, z, 0.0, np.zeros(200), jacobian), 0.0)
+        )
+
+    # The four together move nothing: one factor on all of them is told by what is known of two.
+    alike = {"motor.kt": force, "friction": other, "cogging.sine": third}
+    alike["cogging.cosine"] = -force - other - third
+    (said,) = told({**alike, "slack": rng.standard_normal(200)}, "motor.kt", "friction")
+    assert said.startswith("cogging.sine, cogging.cosine, motor.kt and friction cannot be told apart well")
+    assert "correlations up to 0.99" in said or "correlations up to 1.000" in said
+    (said,) = told({"hand.stiffness": force, "glove": force, "slack": other}, "hand.stiffness")
+    assert said.startswith("glove and hand.stiffness cannot be told apart") and "(correlation -1.000)" in said
+    assert not told({"motor.kt": force, "friction": force, "slack": other}, "motor.kt", "friction")

@@ -24,22 +24,29 @@ leaves."""
 FOLLOWED = 0.25
 """Part of the reference's span that an encoder goes over in a gap of it where there was something to follow."""
 
-MOST_GUESSED = 0.5
-"""Part of the closures up to which those whose reference is guessed are left out: a reference that is logged only when
-it jumps is guessed in all of them."""
-
 MOST_TOLD = 4
 """Gaps that are told one by one."""
 
 LOST = 0.08
-BY_CHANCE = 0.3
-"""Part of a signal's messages from which on it is said that they are lost, and part of the steps of three and more that
-losses by chance make of it: a logger that asks at a rate of its own leaves out one at a time, in turn."""
+"""Part of a signal's messages from which on it is said that they are lost."""
 
 WHOLE = 0.2
 IN_STEP = 0.95
 """Part of its usual step by which a step may miss a whole number of them, and part of the steps that must be such: else
 a signal is logged irregularly, and nothing is lost."""
+
+ONE_STEP = (0.15, 0.02)
+TWO_STEPS = (0.25, 0.01)
+GAPS = (3.0, 3.0)
+"""How far parts of steps may be from those that losses by chance make, as parts of these and beyond that: the steps of
+one, of two, and the number of gaps.  What a logger leaves out that asks at a rate of its own, rounds its stamps, sends
+in bursts or only what changes is distributed otherwise."""
+
+FEWEST_STEPS = 50
+"""Steps of a signal below which nothing is said of losses."""
+
+REGULARLY = 3
+"""Equal neighbours from which on a reference was logged while it stood, and not only where it changes."""
 
 
 def misses_samples(time: Array, start: float, stop: float) -> bool:
@@ -93,26 +100,46 @@ def split_gaps(time: Array, samples: Mapping[str, tuple[Array, Array]]) -> tuple
     return silent, alone
 
 
+def _moves(
+    gap: Span, part: float, reference: tuple[Array, Array], encoder: tuple[Array, Array] | None
+) -> bool:
+    """Whether over a gap the reference changes by a part of its span, or the encoder by FOLLOWED of it within."""
+    (time, values), (a, b) = reference, gap
+    span = float(np.ptp(values))
+    if abs(float(np.diff(np.interp([a, b], time, values))[0])) > part * span:
+        return True
+    done = encoder[1][(encoder[0] > a) & (encoder[0] < b)] if encoder is not None else np.zeros(0)
+    return bool(done.size) and float(np.ptp(done)) > FOLLOWED * span
+
+
 def guessed(
     gaps: Sequence[Span], reference: tuple[Array, Array], encoder: tuple[Array, Array] | None
 ) -> list[Span]:
     """The gaps of the reference alone in which it moves; one that stands, and the hand with it, may be logged only when
     it changes."""
-    time, values = reference
-    span = float(np.ptp(values))
-
-    def moves(a: float, b: float) -> bool:
-        if abs(float(np.diff(np.interp([a, b], time, values))[0])) > MOVES * span:
-            return True
-        done = encoder[1][(encoder[0] > a) & (encoder[0] < b)] if encoder is not None else np.zeros(0)
-        return bool(done.size) and float(np.ptp(done)) > FOLLOWED * span
-
-    return [gap for gap in gaps if moves(*gap)]
+    return [gap for gap in gaps if _moves(gap, MOVES, reference, encoder)]
 
 
-def within(gaps: Sequence[Span], start: float, stop: float) -> list[Span]:
-    """What lies of gaps within a stretch."""
-    return [(max(a, start), min(b, stop)) for a, b in gaps if a < stop and start < b]
+def without_guessed(
+    spans: Sequence[Span],
+    gaps: Sequence[Span],
+    reference: tuple[Array, Array],
+    encoder: tuple[Array, Array] | None,
+) -> list[Span]:
+    """The closures without those of which gaps hide much of the reference; all, if it is logged only where it changes
+    or hidden in each."""
+    if np.count_nonzero(np.diff(reference[1]) == 0.0) < REGULARLY:
+        return list(spans)
+    known = [
+        (start, stop)
+        for start, stop in spans
+        if not any(
+            _moves((max(a, start), min(b, stop)), FOLLOWED, reference, encoder)
+            for a, b in gaps
+            if a < stop and start < b
+        )
+    ]
+    return known or list(spans)
 
 
 def said_of_gaps(silent: Sequence[Span], guesses: Sequence[Span]) -> list[str]:
@@ -130,22 +157,34 @@ def said_of_gaps(silent: Sequence[Span], guesses: Sequence[Span]) -> list[str]:
 
 
 def lost_part(time: Array) -> float:
-    """Part of a signal's messages that are lost: its steps are whole numbers of the usual one, some two or more.
+    """Part of a signal's messages that are lost by chance: its steps are whole numbers of the usual one, and with a
+    part p lost 1 - p of them are one, p (1 - p) two, and at most p^4 more than is bridged (LONGEST_GAP).
 
-    0 where it is logged irregularly, where next to nothing is lost, and for what is a gap.
+    0 where they are not.
     """
+    time = np.unique(time)
     steps = np.diff(time)
-    steps = steps[steps <= _longest_step(time)] if steps.size > 2 else steps[:0]
-    if not steps.size:
+    if steps.size < FEWEST_STEPS:
         return 0.0
-    taken = steps / float(np.quantile(steps, 0.2, method="nearest"))
+    short = steps[steps <= _longest_step(time)]
+    taken = short / float(np.quantile(short, 0.2, method="nearest"))
     whole = np.maximum(np.round(taken), 1.0)
     if np.mean(np.abs(taken - whole) <= WHOLE) < IN_STEP:
         return 0.0
     lost = float(np.sum(whole - 1.0))
-    part = lost / (lost + steps.size)
-    in_turn = np.mean(whole >= 3.0) < BY_CHANCE * part**2
-    return 0.0 if part < LOST or in_turn else part
+    part = lost / (lost + short.size)
+
+    def differ(found: float, expected: float, of: float, limits: tuple[float, float]) -> bool:
+        return abs(found - expected) > limits[0] * of + limits[1]
+
+    one, two = (float(np.mean(whole == count)) for count in (1.0, 2.0))
+    twice, gaps = part * (1.0 - part), steps.size * part ** (LONGEST_GAP - 1.0)
+    by_chance = not (
+        differ(one, 1.0 - part, part, ONE_STEP)
+        or differ(two, twice, twice, TWO_STEPS)
+        or steps.size - short.size > GAPS[0] * gaps + GAPS[1]
+    )
+    return part if by_chance and part >= LOST else 0.0
 
 
 def said_of_losses(times: Mapping[str, Array]) -> list[str]:

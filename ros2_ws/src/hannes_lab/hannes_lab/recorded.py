@@ -15,16 +15,7 @@ from numpy.typing import NDArray
 
 from .closures import SAME_KIND, find_closures, group_closures
 from .described import control_period, hold_rate
-from .gaps import (
-    MOST_GUESSED,
-    guessed,
-    has_gap,
-    said_of_gaps,
-    said_of_losses,
-    split_gaps,
-    widest_gap,
-    within,
-)
+from .gaps import guessed, has_gap, said_of_gaps, said_of_losses, split_gaps, widest_gap, without_guessed
 from .reference import RESTS, reference_on_grid, rest_value
 from .trials import EARLY, SIGNALS, NoClosure, Trial, in_words, left_out, stem_of
 from .units import in_si
@@ -108,24 +99,18 @@ def trial_of(recording: Recording, *, name: str | None = None) -> Trial:
     inside = [(a, min(b, end)) for a, b in spans if a >= begin - EARLY and min(b, end) > a]
     silent, alone = split_gaps(logged[0], samples)
     encoder = samples.get("encoder_position")
-    guesses = guessed(alone, logged, encoder)
-    notes += said_of_gaps(silent, guesses)
-    notes += said_of_losses({s: time for s, (time, _) in samples.items()})
-    known = [span for span in inside if not guessed(within(guesses, *span), logged, encoder)]
-    if len(inside) - len(known) > MOST_GUESSED * len(inside):
-        known = inside
+    notes += said_of_gaps(silent, guessed(alone, logged, encoder))
+    times = {"reference_position": logged[0], **{s: time for s, (time, _) in samples.items()}}
+    notes += said_of_losses(times)
     # A closure that seems to begin where the silence ends began in it.
     whole = [
         span
-        for span in known
+        for span in without_guessed(inside, alone, logged, encoder)
         if not any(has_gap(time, *span) for time, _ in samples.values())
         and not any(a < span[0] <= b for a, b in silent)
     ]
     if inside and not whole:
-        widest = widest_gap(
-            {"reference_position": logged[0], **{s: time for s, (time, _) in samples.items()}}
-        )
-        raise NoClosure(f"Trial '{name}': samples are missing in each of its closures{widest}.")
+        raise NoClosure(f"Trial '{name}': samples are missing in each of its closures{widest_gap(times)}.")
     if len(whole) < len(inside):
         notes.append(left_out(len(inside) - len(whole)))
     closures = group_closures(reference, period, whole, name, channel.period)

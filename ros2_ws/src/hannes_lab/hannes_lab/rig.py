@@ -459,7 +459,7 @@ class PlantRig:
         asked = (wanted, controller.parameters.tobytes(), b"" if before is None else before.tobytes())
         begun, self._latest = self._latest, None
         if begun is None or not begun.begins(plant, controller, asked, reference):
-            self._set(plant, base, wanted)
+            _give(plant, base, wanted)
             if before is not None:
                 rollout(plant, controller, before, joints=False)
             done = rollout(plant, controller, reference, reset=before is None, joints=False)
@@ -468,24 +468,12 @@ class PlantRig:
             rest = rollout(plant, controller, reference[n:], reset=False, begin=n, joints=False)
             done = begun.run.followed_by(rest)
         if reference.size < trial.reference.size:
-            self._latest = _Latest(plant, asked, done, controller.states.copy(), plant.reading.copy())
+            kept = done.copy()  # an adapter may work in the arrays of the one that it gets
+            self._latest = _Latest(
+                plant, controller, asked, kept, controller.states.copy(), plant.reading.copy()
+            )
         self._came_back = came_back(done, trial, self.comes_back(model, trial))
         return done
-
-    @staticmethod
-    def _set(plant: Plant, base: dict[str, float], wanted: Mapping[str, float]) -> None:
-        """Give a plant the wanted parameters, and those of `base`, its own, that are not among them."""
-        for name in set(base) - set(wanted):
-            plant.set(name, base[name])
-        for name, value in wanted.items():
-            if name not in base:
-                if name.startswith("control.") and name not in plant.names:
-                    raise HannesError(
-                        f"'{name}' is a gain of the control law, which the plant does not know: in the adapter's "
-                        "`run`, take it out of `values`, and give the law a model that has it (model.with_values)."
-                    )
-                base[name] = plant.get(name)
-            plant.set(name, value)
 
     def _of(self, model: Model) -> tuple[tuple[str, ...], dict[str, float]]:
         """What tells its plant from another, and the values of its effects; kept while the model is the same."""
@@ -520,6 +508,21 @@ class PlantRig:
         return self._plants[key]
 
 
+def _give(plant: Plant, base: dict[str, float], wanted: Mapping[str, float]) -> None:
+    """Give a plant the wanted parameters, and those of `base`, its own, that are not among them."""
+    for name in set(base) - set(wanted):
+        plant.set(name, base[name])
+    for name, value in wanted.items():
+        if name not in base:
+            if name.startswith("control.") and name not in plant.names:
+                raise HannesError(
+                    f"'{name}' is a gain of the control law, which the plant does not know: in the adapter's "
+                    "`run`, take it out of `values`, and give the law a model that has it (model.with_values)."
+                )
+            base[name] = plant.get(name)
+        plant.set(name, value)
+
+
 @dataclass(frozen=True)
 class _Latest:
     """The latest rollout, and what a longer one must share with it to go on from where it ended.
@@ -529,6 +532,7 @@ class _Latest:
     """
 
     plant: Plant
+    law: Controller
     asked: tuple[Mapping[str, float], bytes, bytes]
     run: Rollout
     states: Array
@@ -541,6 +545,7 @@ class _Latest:
         n = self.run.reference_position.size
         return (
             plant is self.plant
+            and law is self.law
             and asked == self.asked
             and n < reference.size
             and np.array_equal(self.run.reference_position, reference[:n])

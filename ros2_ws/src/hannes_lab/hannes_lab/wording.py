@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from hannes_description.output import number, with_unit
+from scipy.sparse.csgraph import connected_components
 
 from .adequacy import disbelieved, unshown, waves_of
 from .chance import Chance
@@ -609,18 +610,33 @@ def _taken_for_its_own(search: Search, best: Candidate) -> list[str]:
     return notes
 
 
+ALIKE = 0.97
+"""Correlation of two parameters from which it is said that they cannot be told apart well."""
+
+
 def _identifiability(best: Candidate) -> list[str]:
-    """What this data cannot tell: pairs of effect and nuisance parameters that move the data alike."""
+    """What this data cannot tell: effect and nuisance parameters that move the data alike, each set of them once."""
     covariance = best.fit.covariance()
     sd = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sd, sd)
+    known = np.array([bool(c.prior) for c in best.fit.coordinates])
+    alike = (np.abs(correlation) > ALIKE) & ~np.logical_and.outer(known, known)
+    np.fill_diagonal(alike, False)
+    count, sets = connected_components(alike, directed=False)
     notes = []
-    for i, a in enumerate(best.fit.coordinates):
-        for j in range(i):
-            b = best.fit.coordinates[j]
-            if not (a.prior and b.prior) and abs(correlation[i, j]) > 0.97:
-                notes.append(
-                    f"{a.name} and {b.name} cannot be told apart well with these data "
-                    f"(correlation {correlation[i, j]:+.3f})"
-                )
+    for number_ in range(count):
+        own = np.flatnonzero(sets == number_)
+        if own.size < 2:
+            continue
+        own = own[np.argsort(known[own], kind="stable")]  # effects first
+        within = correlation[np.ix_(own, own)][alike[np.ix_(own, own)]]
+        names = [best.fit.coordinates[k].name for k in own]
+        how = (
+            f"correlation {within[0]:+.3f}"
+            if own.size == 2
+            else f"correlations up to {np.abs(within).max():.3f}"
+        )
+        notes.append(
+            f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart well with these data ({how})"
+        )
     return notes

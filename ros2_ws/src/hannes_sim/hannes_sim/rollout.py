@@ -152,6 +152,11 @@ class Rollout:
             raise HannesError("This rollout was made without the finger joints: make it with joints=True.")
         return self.raw[:, first : first + N_JOINTS]
 
+    def copy(self) -> Rollout:
+        """The same in arrays of its own."""
+        own = (self.time, self.reference_position, self.motor_voltage, self.raw)
+        return Rollout(*(values.copy() for values in own))
+
     def followed_by(self, other: Rollout) -> Rollout:
         """This one and then another, which went on from where it ended."""
         return Rollout(
