@@ -7,9 +7,12 @@ import pytest
 from hannes_description.model import Model
 from hannes_lab.compare import compare
 from hannes_lab.diagnose import diagnose, effect_sources
+from hannes_lab.errors import held_out_conditions
+from hannes_lab.fit import fit
 from hannes_lab.join import join_trials
 from hannes_lab.prepare import Prepared, prepare
-from hannes_lab.rig import load_rig
+from hannes_lab.problem import nuisance_coordinate
+from hannes_lab.rig import Nuisance, load_rig
 from hannes_lab.trials import Closure, Trial
 from hannes_sim.factory import make_plant
 from hannes_sim.rollout import VoltagePlayback, rollout
@@ -183,6 +186,20 @@ def test_a_travel_unlike_that_of_the_adapter_is_said(rig: type) -> None:
         sizes = {"N.m": 3.0, "rad": 0.1 / 57.3}
 
     trials = moves(rig, "far", 0.1, 0.0, 2)
+
+    class Rail(rig):
+        """Each file is a small move, at another place of a long rail."""
+
+        sizes = {"N.m": 3.0, "rad": 2.5}
+
+    time, position = trials[0].signals["encoder_position"]
+    there = replace(
+        trials[0], name="there", signals={**trials[0].signals, "encoder_position": (time, position + 2.0)}
+    )
+    assert any("`sizes` say 2.5" in n for n in prepare(trials[:1], Model.load(rig.model), rig=Rail).notes)
+    assert not any(
+        "`sizes` say" in n for n in prepare([trials[1], there], Model.load(rig.model), rig=Rail).notes
+    )
     notes = prepare(trials, Model.load(rig.model), rig=Degrees).notes
     assert any("encoder_position goes over 0.1 m, and the adapter's `sizes` say 0.0017" in n for n in notes)
     assert not any("`sizes` say" in note for note in prepared(rig, *trials).notes)
@@ -230,6 +247,55 @@ def test_a_recorded_command_is_replayed_without_a_controller(rig: type) -> None:
     errors = {e.signal: e.rmse for e in result.errors}
     assert errors["drive_force"] < 1e-9 and errors["encoder_position"] < 1e-3
     assert not any("reference, which the simulated one" in note for note in found.notes)
+    factor = 1e3 * model.parameters.value("supply.voltage") / np.abs(command.reference).max()
+    wrong = prepare([replace(command, reference=factor * command.reference)], model, rig=Open)
+    assert any(note.startswith("the command that is played back reaches") for note in wrong.notes)
+    assert not any("played back" in note for note in found.notes)
+
+
+def test_a_current_that_is_played_back_is_known(rig: type) -> None:
+    """Without a signal of it: it is the reference."""
+    (one,) = moves(rig, "open", 0.05, 0.0, 1)
+    position = {"encoder_position": one.signals["encoder_position"]}
+    command = replace(one, reference=one.signals["drive_force"][1], signals=position)
+
+    class Open(rig):
+        def controller(self, model, period):
+            return VoltagePlayback(period)
+
+    def said(kind: type, compensated: float) -> bool:
+        model = Model.load(rig.model).with_values({"motor.emf_compensated": compensated})
+        notes = prepare([command], replace(model, controller="double_pid"), rig=kind).notes
+        return any("friction, torque constant and inertia are hard to tell apart" in note for note in notes)
+
+    assert not said(Open, 1.0)
+    assert said(Open, 0.0), "a voltage tells no torque"
+
+
+def test_what_a_condition_alone_shows_is_not_known_where_it_is_left_out(rig: type) -> None:
+    """A tolerance draws it to where it is expected, but weighs nothing where much else is left: the fit ends before."""
+
+    class Place(rig):
+        def run(self, model, values, trial, reference):
+            wanted = dict(values)
+            push = wanted.pop("place.far", 0.0)
+            if trial.conditions == ("far",):
+                wanted["friction.viscous"] = model.parameters.value("friction.viscous") * (1.0 + 0.1 * push)
+            return super().run(model, wanted, trial, reference)
+
+    trials = moves(rig, "far", 0.1, 0.0, 3) + moves(rig, "near", 0.02, 0.0, 3)
+    for k, trial in enumerate(trials):
+        time, position = trial.signals["encoder_position"]
+        bent = position + 2e-3 * np.sin(40.0 * time) + 2e-7 * k
+        trials[k] = replace(trial, signals={**trial.signals, "encoder_position": (time, bent)})
+    found = prepare(trials, Model.load(rig.model), rig=Place)
+    own = Nuisance("place.far", 0.0, 1.0, False, 0.0, "1")
+    coordinates = [nuisance_coordinate(n) for n in (*found.nuisances, own)]
+    start = fit(found.problem, found.model, coordinates, {}).z
+    start[-1] = -2.6
+    left_out = held_out_conditions(found.problem, found.model, coordinates, start)
+    assert abs(left_out["far"][1]["place.far"]) < 1e-6
+    assert abs(left_out["near"][1]["place.far"]) > 1e-3, "there it is seen"
 
 
 def test_closures_of_a_condition_in_trials_of_several_are_said_to_be_no_repeats(rig: type) -> None:

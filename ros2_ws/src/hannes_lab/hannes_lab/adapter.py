@@ -19,6 +19,7 @@ from hannes_description.model import Model
 from hannes_description.signals import SIGNALS
 from hannes_sim.effect import catalogue
 from hannes_sim.plant import PlantDiverged
+from hannes_sim.rollout import VoltagePlayback
 from numpy.typing import NDArray
 
 from .features import Features, kind_of, stands_for_all
@@ -40,6 +41,8 @@ FAR_OFF = 100.0
 
 OTHER_SIZE = 20.0
 """Times that a travel may differ from that of an adapter's `sizes`; degrees for rad are 57."""
+
+SUPPLY, COMPENSATED = "supply.voltage", "motor.emf_compensated"
 
 SHORTEST = 3.0
 """Control periods that a closure lasts at least."""
@@ -381,23 +384,22 @@ def other_units(rig: Rig, model: Model, features: Features) -> list[str]:
     """
     out: dict[str, str] = {}
     travel = getattr(rig, "sizes", {}).get("rad")
-    moves = [
-        (float(np.ptp(t.signals[ENCODER][1])), t.unit(ENCODER))
-        for t in features.trials
-        if ENCODER in t.signals
-    ]
+    moves = [(t.signals[ENCODER][1], t.unit(ENCODER)) for t in features.trials if ENCODER in t.signals]
     if travel and moves:
-        most, unit = max(moves)
-        if not 1.0 / OTHER_SIZE < most / travel < OTHER_SIZE:
+        most = max(float(np.ptp(own)) for own, _ in moves)
+        whole = max(float(own.max()) for own, _ in moves) - min(float(own.min()) for own, _ in moves)
+        if most >= OTHER_SIZE * travel or whole <= travel / OTHER_SIZE:
             out["sizes"] = (
-                f"{ENCODER} goes over {most:.3g} {unit}, and the adapter's `sizes` say {travel:g}: is one of them in "
-                "another unit? The bounds of effects follow from it"
+                f"{ENCODER} goes over {most:.3g} {moves[0][1]}, and the adapter's `sizes` say {travel:g}: is one of "
+                "them in another unit? The bounds of effects follow from it"
             )
     for trial, end in zip(features.trials, features.ends, strict=True):
         try:
             simulated = rig.simulate(model, {}, trial, trial.reference[:end])
         except PlantDiverged:
             continue
+        if said := _cut_off(rig, model, trial):
+            out["supply"] = said
         for name, (time, values) in trial.signals.items():
             if name not in simulated or name in out:
                 continue
@@ -409,6 +411,30 @@ def other_units(rig: Rig, model: Model, features: Features) -> list[str]:
             if said:
                 out[name] = said
     return list(out.values())
+
+
+def plays_back(rig: Rig) -> bool:
+    """Whether the last simulation was driven by what was recorded of the command, and not by a law."""
+    return isinstance(getattr(rig, "law_used", None), VoltagePlayback)
+
+
+def current_is_known(rig: Rig, model: Model) -> bool:
+    """Whether that command was the current itself."""
+    own = model.parameters
+    return plays_back(rig) and COMPENSATED in own and own.value(COMPENSATED) == 1.0
+
+
+def _cut_off(rig: Rig, model: Model, trial: Trial) -> str | None:
+    """That a command is played back of which the plant takes only a small part, if so."""
+    if not (plays_back(rig) and SUPPLY in model.parameters):
+        return None
+    most, limit = float(np.abs(trial.reference).max()), model.parameters.value(SUPPLY)
+    if most <= OTHER_SIZE * limit:
+        return None
+    return (
+        f"the command that is played back reaches {most:.4g}, and the plant takes {SUPPLY}, {limit:g}, at most: is it "
+        "in another unit?"
+    )
 
 
 def _unlike(name: str, unit: str, reference: Samples, simulated: Samples, measured: Samples) -> str | None:

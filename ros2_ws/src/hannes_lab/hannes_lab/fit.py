@@ -257,6 +257,7 @@ class Derivatives:
     known   derivatives by coordinate name with which to begin; these are only taught
     steps   of the finite differences, by coordinate name
     cost    of a whitened residual (size,) at a point z (k,)
+    use     (size,) features that take part: what the others show teaches nothing
     most    derivatives that are taken by finite differences at most, but for the first ones
     taken   how many were
     fresh   True where none was taught since
@@ -270,10 +271,11 @@ class Derivatives:
         known: Mapping[str, Array],
         steps: Mapping[str, float],
         cost: Callable[[Array, Array], float],
+        use: Mask,
         most: int,
     ) -> None:
         self.problem, self.model, self.coordinates = problem, model, coordinates
-        self.steps, self.cost, self.most = dict(steps), cost, most
+        self.steps, self.cost, self.use, self.most = dict(steps), cost, use, most
         self.unknown = [j for j, c in enumerate(coordinates) if c.name not in known]
         self.jacobian = np.column_stack(
             [known.get(c.name, np.zeros(problem.features.size)) for c in coordinates]
@@ -297,11 +299,12 @@ class Derivatives:
             self.fresh = True
         elif move.any():
             change, along = residual - self.residual, self.jacobian @ move
-            whole = float(along @ along)
+            part = np.where(self.use, along, 0.0)
+            whole = float(part @ part)
             # What a short step missed is the simulation's roughness.
-            if whole > 0.0 and np.linalg.norm(change) > ROUGHNESS:
+            if whole > 0.0 and np.linalg.norm(change[self.use]) > ROUGHNESS:
                 missed = TAUGHT * (change - along) / whole
-                self.jacobian = self.jacobian + np.outer(missed, along @ self.jacobian)
+                self.jacobian = self.jacobian + np.outer(missed, part @ self.jacobian)
             self.fresh = False
         self.z, self.residual = z.copy(), residual
         return self.jacobian
@@ -421,7 +424,9 @@ def fit(
     if isinstance(start, Mapping):
         start = np.array([start.get(c.name, 0.0) for c in coordinates])
     most = evaluations * (1 + sum(c.name not in known for c in coordinates))
-    derivatives = Derivatives(problem, model, coordinates, known, steps or {}, objective.cost, most)
+    derivatives = Derivatives(
+        problem, model, coordinates, known, steps or {}, objective.cost, objective.use, most
+    )
     z, complete = _descend(objective, derivatives, objective.inside(start), little, worth)
     if rows is not None:
         z = _unseen_at_rest(objective, derivatives, z)
@@ -480,11 +485,10 @@ def _descend(
 
 
 def _unseen_at_rest(objective: _Objective, derivatives: Derivatives, z: Array) -> Array:
-    """The point with what the features that take part do not show put where it vanishes, or is typical (see UNSEEN):
-    what is drawn by so little may not arrive before a fit ends."""
+    """The point with what the features that take part do not show put where it vanishes, is typical, or is expected
+    (see UNSEEN): what is drawn by so little may not arrive before a fit ends, nor by a prior where much is left."""
     moves = np.linalg.norm(derivatives.at(z, objective.residual(z))[objective.use], axis=0)
-    unseen = (moves <= UNSEEN) & (prior_weights(objective.coordinates) == 0.0) & (z != 0.0)
-    return np.where(unseen, objective.inside(np.zeros(z.size)), z)
+    return np.where((moves <= UNSEEN) & (z != 0.0), objective.inside(np.zeros(z.size)), z)
 
 
 def _at_the_liked_factor(objective: _Objective, z: Array) -> Array:

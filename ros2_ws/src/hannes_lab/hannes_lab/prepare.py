@@ -15,7 +15,7 @@ from hannes_description.model import Model
 from hannes_sim.effect import call_own
 from numpy.typing import NDArray
 
-from .adapter import check_rig, check_trials, other_units
+from .adapter import check_rig, check_trials, current_is_known, other_units
 from .blocks import in_blocks, told_apart
 from .drift import drift_of, drift_together
 from .features import Features, build_features
@@ -329,7 +329,7 @@ def prepare(
         of_plant = other_plant(trials, model)
     else:
         of_plant = [*told, *other_units(made, model, features), *_nominal_of_another(model)]
-    notes = (*notes_of(trials), *of_plant, *_what_is_missing(trials, features, made))
+    notes = (*notes_of(trials), *of_plant, *_what_is_missing(trials, features, made, model))
     return Prepared(made, model, features, problem, nuisances, tuple(dict.fromkeys(notes)))
 
 
@@ -354,7 +354,7 @@ def _nominal_of_another(model: Model) -> list[str]:
     ]
 
 
-def _what_is_missing(trials: Sequence[Trial], features: Features, rig: Rig) -> list[str]:
+def _what_is_missing(trials: Sequence[Trial], features: Features, rig: Rig, model: Model) -> list[str]:
     """What these recordings cannot say: conditions, signals and closures that are not there, closures that drift."""
     present = dict.fromkeys(block.signal for block in features.blocks)
     notes = []
@@ -362,7 +362,7 @@ def _what_is_missing(trials: Sequence[Trial], features: Features, rig: Rig) -> l
         notes.append(
             "there is one condition only: what fits it may fail elsewhere; record another speed, and another load"
         )
-    if not any(signal in present for signal in rig.drive_signals):
+    if not (any(signal in present for signal in rig.drive_signals) or current_is_known(rig, model)):
         drive = (*rig.drive_signals, "motor_current")[0].removeprefix("motor_").replace("_", " ")
         only = "" if isinstance(rig, HandRig) else f" (only {', '.join(present)})"
         notes.append(
