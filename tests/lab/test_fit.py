@@ -79,7 +79,9 @@ def derivatives(problem: Curved, known: dict[str, np.ndarray], most: int = 10) -
     def cost(r: np.ndarray, z: np.ndarray) -> float:
         return float(r @ r)
 
-    found = Derivatives(as_problem(problem), Model.load(), (A, B), known, {}, cost, np.ones(2, dtype=bool), most)
+    found = Derivatives(
+        as_problem(problem), Model.load(), (A, B), known, {}, cost, np.ones(2, dtype=bool), most
+    )
     found.at(BEGIN, problem.at(BEGIN))
     return found
 

@@ -1,9 +1,11 @@
 """Recordings of a rig in several files: those that repeat one condition are taken together, as bags are."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hannes_description.errors import HannesError
 from hannes_description.model import Model
 from hannes_lab.compare import compare
 from hannes_lab.diagnose import diagnose, effect_sources
@@ -270,6 +272,53 @@ def test_a_current_that_is_played_back_is_known(rig: type) -> None:
 
     assert not said(Open, 1.0)
     assert said(Open, 0.0), "a voltage tells no torque"
+
+
+def test_each_recording_may_have_a_value_of_its_own(rig: type, tmp_path: Path) -> None:
+    """A friction by place: each file is at another one."""
+    viscous = (3.0, 4.0, 6.5)
+    trials = []
+    for k, value in enumerate(viscous):
+
+        class There(rig):
+            model = tmp_path / f"m{k}.yaml"
+
+        write_files(tmp_path)
+        text = (tmp_path / "parameters.yaml").read_text().replace("value: 4.0", f"value: {value}")
+        (tmp_path / f"p{k}.yaml").write_text(text)
+        text = (tmp_path / "mass.yaml").read_text().replace("parameters.yaml", f"p{k}.yaml")
+        (tmp_path / f"m{k}.yaml").write_text(text)
+        (one, *_) = moves(There, f"place{k}", 0.05 + 0.01 * k, 0.0, 1)
+        trials.append(one)
+    tolerances = tmp_path / "each.yaml"
+
+    class Each(rig):
+        population = tolerances
+
+    def lines(*own: str) -> None:
+        tolerances.write_text(
+            "".join(f"{n}: {{sd: 0.5, closure_sd: 0.0, unit: '1', source: test}}\n" for n in own)
+        )
+
+    lines("motor.armature", "friction.viscous@each")
+    found = prepare(trials, Model.load(rig.model), rig=Each)
+    assert [n.name for n in found.nuisances] == [
+        "motor.armature",
+        *(f"friction.viscous@place{k}0" for k in range(3)),
+    ]
+    table = compare(found, fitted=True).nuisances
+    for k, value in enumerate(viscous):
+        assert table[f"friction.viscous@place{k}0"]["value"] == pytest.approx(value, rel=0.02)
+    answer = diagnose(found, effect_sources(only=["coulomb_friction"]))
+    assert answer.effects == () and set(answer.nuisances) == {n.name for n in found.nuisances}
+    for wrong in (
+        ("friction.viscous@place00",),
+        ("friction.viscous@each", "friction.viscous"),
+        ("control.kp@each",),
+    ):
+        lines(*wrong)
+        with pytest.raises(HannesError, match="of which each recording has a value of its own is called"):
+            prepare(trials, Model.load(rig.model), rig=Each)
 
 
 def test_what_a_condition_alone_shows_is_not_known_where_it_is_left_out(rig: type) -> None:

@@ -46,6 +46,9 @@ LEAST = 0.01
 """Relative tolerances up to the first are on a linear scale: an effect that adds to the parameter then leaves a
 straight valley, along which a fit finds its way.  All go down to the second part of the nominal value."""
 
+EACH = "each"
+"""In a file of tolerances, `NAME@each`: each recording has a value of its own."""
+
 REMEMBERED = 48
 """Simulations whose signals are kept: those of a whole Jacobian of three trials."""
 
@@ -282,8 +285,28 @@ class PlantRig:
                 f"{self.population}: there are no tolerances in it; give a line for each uncertain parameter, such as "
                 '`motor.kt: {sd: 0.03, closure_sd: 0.0, unit: "1", source: magnets}`.'
             )
-        usual = [self._within(self._nuisance(name, entry, model), model) for name, entry in table.items()]
+        usual = [
+            self._within(self._nuisance(name, entry, model), model)
+            for name, entry in self._for_each(table, model)
+        ]
         return self.as_told(usual, model)
+
+    def _for_each(self, table: Mapping[str, Any], model: Model) -> list[tuple[str, Any]]:
+        """Tolerances by name; one of `NAME@each` stands for a value of its own of each recording, `NAME@recording`."""
+        out: list[tuple[str, Any]] = []
+        for name, entry in table.items():
+            own, at, where = str(name).partition("@")
+            if not at:
+                out.append((name, entry))
+                continue
+            twice = own in table or (own in model.names and model.named(own).tolerance is not None)
+            if where != EACH or twice or self.is_gain(own):
+                raise HannesError(
+                    f"{self.population}: '{name}': a parameter of which each recording has a value of its own is "
+                    f"called {own}@{EACH}, has no tolerance for all of them beside it, and is no gain of the law."
+                )
+            out += [(f"{own}@{trial.name}", entry) for trial in self.trials]
+        return out
 
     def as_told(self, usual: Sequence[Nuisance], model: Model) -> list[Nuisance]:
         """Priors where the model's file says itself how well a value is known.
@@ -317,9 +340,10 @@ class PlantRig:
 
         said_in  the file that says the tolerance, if it is not that of the tolerances
         """
-        if nuisance.name not in model.names:
+        name = nuisance.name.partition("@")[0]
+        if name not in model.names:
             return nuisance
-        own = model.named(nuisance.name)
+        own = model.named(name)
         if own.lower >= own.upper:
             raise HannesError(
                 f"{said_in or self.population}: '{nuisance.name}' has a tolerance, but its bounds hold it at "
@@ -337,16 +361,17 @@ class PlantRig:
             ) from error
         if not (math.isfinite(sd) and sd > 0.0):
             raise HannesError(f"{self.population}: '{name}': sd is {sd:g}; it must be a number above 0.")
-        if name == REFERENCE_DELAY:
+        of_all = name.partition("@")[0]
+        if of_all == REFERENCE_DELAY:
             if str(entry["unit"]) != "s":
                 raise HannesError(f"{self.population}: '{name}' is a time in s, not in {entry['unit']!r}.")
             return Nuisance(name, 0.0, sd, False, scatter, "s")
-        own = model.named(name)
+        own = model.named(of_all)
         unit, mean = own.unit, own.value
         if relative and mean <= 0.0:
             raise HannesError(
                 f"{self.population}: '{name}' has a relative tolerance (unit \"1\"), but is {mean:g} {unit} in "
-                f"{model.parameters.origin(name)}: give it a value above 0, or a tolerance in {unit!r}."
+                f"{model.parameters.origin(of_all)}: give it a value above 0, or a tolerance in {unit!r}."
             )
         if not relative:
             return Nuisance(name, mean, sd, False, scatter, unit)
