@@ -413,7 +413,7 @@ def other_units(rig: Rig, model: Model, features: Features) -> list[str]:
     return list(out.values())
 
 
-def plays_back(rig: Rig) -> bool:
+def _plays_back(rig: Rig) -> bool:
     """Whether the last simulation was driven by what was recorded of the command, and not by a law."""
     return isinstance(getattr(rig, "law_used", None), VoltagePlayback)
 
@@ -421,12 +421,12 @@ def plays_back(rig: Rig) -> bool:
 def current_is_known(rig: Rig, model: Model) -> bool:
     """Whether that command was the current itself."""
     own = model.parameters
-    return plays_back(rig) and COMPENSATED in own and own.value(COMPENSATED) == 1.0
+    return _plays_back(rig) and COMPENSATED in own and own.value(COMPENSATED) == 1.0
 
 
 def _cut_off(rig: Rig, model: Model, trial: Trial) -> str | None:
     """That a command is played back of which the plant takes only a small part, if so."""
-    if not (plays_back(rig) and SUPPLY in model.parameters):
+    if not (_plays_back(rig) and SUPPLY in model.parameters):
         return None
     most, limit = float(np.abs(trial.reference).max()), model.parameters.value(SUPPLY)
     if most <= OTHER_SIZE * limit:

@@ -552,8 +552,9 @@ def _give(plant: Plant, base: dict[str, float], wanted: Mapping[str, float]) -> 
 class _Latest:
     """The latest rollout, and what a longer one must share with it to go on from where it ended.
 
-    asked           parameters of the plant, those of the law, and the reference before
-    states, reading of law and plant at its end
+    asked    parameters of the plant, those of the law, and the reference before
+    run      in arrays of its own
+    states   of the law, and reading of the plant, at its end
     """
 
     plant: Plant
