@@ -30,7 +30,7 @@ def simulated(trial: Trial, **hysteresis: float) -> tuple[list[int], float, floa
     ticks: list[int] = []
 
     class Counted(HandRig):
-        def run(self, model, values, trial, reference):  # type: ignore[no-untyped-def]
+        def run(self, model, values, trial, reference):
             ticks.append(reference.size)
             return super().run(model, values, trial, reference)
 
@@ -110,13 +110,13 @@ def test_an_adapter_may_work_in_the_arrays_of_a_simulation(trial: Trial) -> None
     """What it changes there is not changed once more where a longer one goes on."""
 
     class InPlace(HandRig):
-        def run(self, model, values, trial, reference):  # type: ignore[no-untyped-def]
+        def run(self, model, values, trial, reference):
             done = super().run(model, values, trial, reference)
             done.encoder_position[:] -= 0.01
             done.reference_position[:] += 0.5
             return done
 
-        def logged(self, run, trial, window=None):  # type: ignore[no-untyped-def]
+        def logged(self, run, trial, window=None):
             out = super().logged(run, trial, window)
             out["encoder_position"] += 0.02
             return out

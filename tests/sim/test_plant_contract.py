@@ -35,7 +35,7 @@ def _variant(**options: str) -> Model:
 
 
 @cfunc(CONTROL_SIGNATURE)
-def _swing(x, p, s):  # type: ignore[no-untyped-def]
+def _swing(x, p, s):
     s[0] += x[C_PERIOD] * (x[C_REFERENCE] - x[C_POSITION])
     return 3.0 * math.sin(9.0 * x[C_TIME]) + s[0]
 

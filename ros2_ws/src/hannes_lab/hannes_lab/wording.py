@@ -22,6 +22,7 @@ from .falls import NOMINAL_FITTED, WITHOUT_EFFECT, clearly_less, deciding_errors
 from .fit import Fit, fit
 from .intervals import grain_widens
 from .problem import Coordinate, Problem, nuisance_coordinate
+from .report_text import listed
 from .rig import Nuisance
 from .scan import period_of
 from .search import FAR, PENALTY, Candidate, Search, key_of
@@ -624,19 +625,15 @@ def _identifiability(best: Candidate) -> list[str]:
     np.fill_diagonal(alike, False)
     count, sets = connected_components(alike, directed=False)
     notes = []
-    for number_ in range(count):
-        own = np.flatnonzero(sets == number_)
+    for own in (np.flatnonzero(sets == k) for k in range(count)):
         if own.size < 2:
             continue
-        own = own[np.argsort(known[own], kind="stable")]  # effects first
         within = correlation[np.ix_(own, own)][alike[np.ix_(own, own)]]
-        names = [best.fit.coordinates[k].name for k in own]
+        names = [best.fit.coordinates[k].name for k in sorted(own, key=known.__getitem__)]  # effects first
         how = (
             f"correlation {within[0]:+.3f}"
             if own.size == 2
             else f"correlations up to {np.abs(within).max():.3f}"
         )
-        notes.append(
-            f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart well with these data ({how})"
-        )
+        notes.append(f"{listed(names)} cannot be told apart well with these data ({how})")
     return notes
